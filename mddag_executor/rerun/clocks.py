@@ -94,7 +94,7 @@ class VirtualTime:
         replace(threading.Thread, 'join', self._thread_join)
         # The one in C waits without asking anybody; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
-        replace(random.Random, 'seed', self._seeding)
+        replace(random.Random, 'seed', self._random_seed)
         # that of the module is a method of a generator, bound before
         replace(random, 'seed', lambda original: partial(random.Random.seed, original.__self__))
         random.seed(self._seed)
@@ -122,7 +122,7 @@ class VirtualTime:
         def now(clock: Clock) -> Time:
             kind = clock.clock_type
             if self._is_virtual(clock):
-                if loop.run_threads.current() is not None:
+                if loop.in_run:
                     loop.note_poll()
                 return Time(nanoseconds=loop.now, clock_type=kind)
             if kind is not ClockType.ROS_TIME:
@@ -134,7 +134,7 @@ class VirtualTime:
     def _sleep_until(self, original: Callable[..., bool]) -> Callable[..., bool]:
         def sleep_until(clock: Clock, until: Time, context: Any = None) -> bool:
             loop = self._loop
-            if loop.run_threads.current() is None or not (
+            if not loop.in_run or not (
                     self._is_virtual(clock) or clock.clock_type == ClockType.ROS_TIME):
                 return original(clock, until, context)
             if until.clock_type != clock.clock_type:
@@ -152,7 +152,7 @@ class VirtualTime:
     def call(self, original: Callable[..., Any], args: tuple[Any, ...]) -> Any:
         """Do what a function of ``time`` does, or ``urandom``."""
         loop, name = self._loop, original.__name__
-        if loop.run_threads.current() is None:
+        if not loop.in_run:
             return original(*args)
         if name == 'urandom':
             return self._random.randbytes(*args)
@@ -171,7 +171,7 @@ class VirtualTime:
 
     def _warn_of(self, what: str, depth: int) -> None:
         """Warn of a function that code of a node calls, which is so many calls further up."""
-        if self._loop.run_threads.current() is None:
+        if not self._loop.in_run:
             return
         caller = sys._getframe(depth)
         if is_library(caller.f_globals.get('__name__', '')):
@@ -182,13 +182,13 @@ class VirtualTime:
 
     # --- random numbers --------------------------------------------------------------------------
 
-    def _seeding(self, original: Callable[..., None]) -> Callable[..., None]:
+    def _random_seed(self, original: Callable[..., None]) -> Callable[..., None]:
         def seed(generator: random.Random, a: Any = None, version: int = 2) -> None:
             caller = sys._getframe(1)
             while caller.f_back is not None and caller.f_globals.get('__name__') == 'random':
                 caller = caller.f_back
             # libraries keep what they draw
-            if a is None and self._loop.run_threads.current() is not None and not is_library(
+            if a is None and self._loop.in_run and not is_library(
                     caller.f_globals.get('__name__', '')):
                 a = self._random.getrandbits(128)
             original(generator, a, version)
@@ -199,16 +199,15 @@ class VirtualTime:
 
     def _allocate_lock(self, original: Callable[[], Any]) -> Callable[[], Any]:
         def allocate() -> Any:
-            run_threads = self._loop.run_threads
-            in_run = run_threads.current() is not None and not run_threads.over
-            return _Waiter(self._loop) if in_run else original()
+            loop = self._loop
+            return original() if not loop.in_run or loop.run_threads.over else _VirtualLock(loop)
 
         return allocate
 
     def _thread_start(self, original: Callable[[Any], None]) -> Callable[[Any], None]:
         def start(thread: threading.Thread) -> None:
             run_threads = self._loop.run_threads
-            if run_threads.current() is None or run_threads.over:
+            if not self._loop.in_run or run_threads.over:
                 original(thread)
                 return
             run_thread = self._threads[thread] = run_threads.make(f'thread {thread.name}')
@@ -223,7 +222,7 @@ class VirtualTime:
     def _thread_join(self, original: Callable[..., None]) -> Callable[..., None]:
         def join(thread: threading.Thread, timeout: float | None = None) -> None:
             loop, run_thread = self._loop, self._threads.get(thread)
-            if run_thread is None or loop.run_threads.current() is None or loop.run_threads.over:
+            if run_thread is None or not loop.in_run or loop.run_threads.over:
                 original(thread, timeout)
                 return
             loop.wait(lambda: run_thread.ended, timeout, f'for thread {thread.name}')
@@ -231,7 +230,7 @@ class VirtualTime:
         return join
 
 
-class _Waiter:
+class _VirtualLock:
     """A lock of a run thread, which waits for it in virtual time."""
 
     def __init__(self, loop: Loop) -> None:

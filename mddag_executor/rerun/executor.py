@@ -72,7 +72,7 @@ class RerunHost(Host):
     ) -> None:
         """Wait in virtual time for something, the end of the run or the program, or a time."""
         loop = self._loop
-        if loop.run_threads.current() is None:
+        if not loop.in_run:
             super().wait(changed, until, timeout_s, guest)
             return
         if timeout_s is not None:  # callbacks are to run meanwhile

@@ -157,7 +157,7 @@ class Loop:
 
     def call_in_run(self, function: Callable[[], None]) -> None:
         """Call a function at once, or, if a foreign thread calls, as soon as possible."""
-        if self.run_threads.current() is not None:
+        if self.in_run:
             function()
         else:
             self._foreign.append(function)
@@ -172,9 +172,14 @@ class Loop:
         self._stopped = True
 
     @property
+    def in_run(self) -> bool:
+        """Return whether the calling thread is the run thread that has the turn."""
+        return self.run_threads.current() is not None
+
+    @property
     def current(self) -> Execution | None:
         """Return the execution whose callback runs in the calling thread; None for no callback."""
-        return self._current if self.run_threads.current() is not None else None
+        return self._current if self.in_run else None
 
     def here(self) -> str:
         """Return what runs, for messages."""
@@ -228,7 +233,7 @@ class Loop:
 
     def refresh_now(self) -> None:
         """Bring up to date which entities there are, if any may have come or gone."""
-        if self.changed and self.run_threads.current() is not None:
+        if self.changed and self.in_run:
             self.changed = False
             self._refresh()
 

@@ -126,7 +126,7 @@ class Messages:
         replace(Node, 'count_subscribers', instead(
             lambda node, topic_name: self._count_subscribers(node.resolve_topic_name(topic_name))))
         for name in filter(_ASK_MIDDLEWARE.fullmatch, list(vars(Node))):
-            replace(Node, name, self._asking)
+            replace(Node, name, self._ask_middleware)
 
     # --- publishers and subscriptions ------------------------------------------------------------
 
@@ -175,7 +175,7 @@ class Messages:
 
     # --- questions about the ROS graph -----------------------------------------------------------
 
-    def _asking(self, original: Callable[..., Any]) -> Callable[..., Any]:
+    def _ask_middleware(self, original: Callable[..., Any]) -> Callable[..., Any]:
         def ask(node: Node, *args: Any, **more: Any) -> Any:
             self._loop.warn(
                 f'{node.get_fully_qualified_name()}: {original.__name__} asks the middleware, '
@@ -206,7 +206,7 @@ class Messages:
             data = msg
         else:
             raise TypeError(f'Expected {publisher.msg_type}, got {type(msg)}')
-        if self._loop.run_threads.current() is None:
+        if not self._loop.in_run:
             self._loop.warn(
                 f'{outlet.state.topic}: a thread publishes on it that is not of the run: when '
                 'that happens depends on the machine')

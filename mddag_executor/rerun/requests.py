@@ -74,8 +74,8 @@ class Requests:
         replace(Client, 'wait_for_service', instead(self._wait_for_service))
         replace(ActionClient, 'wait_for_server', instead(self._wait_for_server))
         replace(Service, 'send_response', instead(self.send_response))
-        replace(ActionClient, '__init__', self._made)
-        replace(ActionServer, '__init__', self._made)
+        replace(ActionClient, '__init__', self._action_init)
+        replace(ActionServer, '__init__', self._action_init)
         replace(CLIENT_HANDLE, 'is_action_server_available',
                 instead(lambda handle: bool(self._peers(handle))))
         replace(SERVER_HANDLE, 'publish_feedback', instead(self._feedback))
@@ -154,7 +154,7 @@ class Requests:
 
     # --- actions ---------------------------------------------------------------------------------
 
-    def _made(self, original: Callable[..., None]) -> Callable[..., None]:
+    def _action_init(self, original: Callable[..., None]) -> Callable[..., None]:
         """Return a constructor that keeps by which name an action is known."""
         timeout = signature(original).parameters.get('result_timeout')  # of servers only
 

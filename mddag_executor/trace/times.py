@@ -29,7 +29,8 @@ def joined(several: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     found: list[tuple[int, int]] = []
     for start, end in sorted(several):
         if found and start - found[-1][1] <= GAP_NS:
-            start, end = found[-1][0], max(end, found.pop()[1])
+            start, until = found.pop()
+            end = max(end, until)
         found.append((start, end))
     return found
 

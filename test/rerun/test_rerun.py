@@ -179,10 +179,10 @@ def test_the_trace_replays_and_gives_the_times(bag, graph, tmp_path):
     assert len(handles['ros2:rclcpp_publish'] & handles['ros2:rcl_publisher_init']) == 2
     graph.write_text(GRAPH.replace('10ms', '30ms'))
     longer = write_bag(tmp_path / 'longer.mcap', [
-        (i * 100, '/points', Header(frame_id=str(i))) for i in range(-2, 20)])
+        (i * 100 + 40 * (i == 0), '/points', Header(frame_id=str(i))) for i in range(-2, 20)])
     result = rerun(longer, graph, [Filter, Sink], times=trace)
     assert [time for time, _ in published(result, '/filtered')] == [
-        100.0 * i + (40 if i == 0 else 10) for i in range(-2, 20)]
+        100.0 * i + (80 if i == 0 else 10) for i in range(-2, 20)]
 
 
 @pytest.mark.parametrize('takes', [', execution_time: 10ms', ''])

@@ -110,6 +110,8 @@ def test_events_beyond_the_table_and_rosbags_reads_them(tmp_path):
         file.add('rcl_node_init', 1, VPID, 2, 3, 4, 'name', '/')
         file.add(keys[0], 2, VPID, 2, 3, -4)
         file.add(keys[1], 3, VPID, 2, range(16), ['a', 'b'])
+        with pytest.raises(TraceError, match='15 values for an array of 16'):
+            file.add(keys[1], 3, VPID, 2, range(15), [])
     reader = TraceReader(path)
     assert list(reader.events()) == [
         ('ros2:rcl_publish', 4, VPID, 2, None, 7),      # the table's fields, None where missing
