@@ -220,12 +220,8 @@ def is_ordinary(path: str) -> bool:
         names = _names_in(path)
         files = [os.path.join(path, name) for name in names if _BAG_FILE.fullmatch(name)]
         is_bag = _METADATA in names     # even if its files are damaged or gone
-    for file in files:
-        found = _trace_or_bag(file)
-        if isinstance(found, TraceReader):
-            return False
-        is_bag = is_bag or found
-    return is_bag
+    found = [_trace_or_bag(file) for file in files]
+    return (is_bag or any(found)) and not any(isinstance(each, TraceReader) for each in found)
 
 
 def _names_in(folder: str) -> list[str]:

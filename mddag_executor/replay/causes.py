@@ -209,8 +209,11 @@ def find(
     total = np.zeros((len(rows), len(PARTS)), dtype=np.int64)
     np.add.at(total, of, times)
     sinks = rows['sink']
-    unusual = _unusual(total, usual.lags[dag_of[sinks]])
-    short = _too_short(rows, unusual.sum(axis=1), deadline[sinks])
+    unusual = total[:, :len(CAUSES)].copy()
+    unusual[:, RELEASED_LATE] = np.maximum(0, total[:, RELEASED_LATE] - usual.lags[dag_of[sinks]])
+    # the deadline is shorter than the usual times
+    excess, lateness = unusual.sum(axis=1), rows['until'] - rows['release'] - deadline[sinks]
+    short: Mask = (excess == 0) | ((rows['kind'] == SINK_LATE) & (excess < lateness))
     amounts = np.where(short[:, np.newaxis], total[:, :len(CAUSES)], unusual)
     amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
     causes = _causes(rows, total, amounts, pool, never, is_source)
@@ -324,19 +327,6 @@ def _pending(
         else:
             is_skipped = is_source[vertex] and key not in never.dropped and waiting_job >= 0
             times[i, SKIPPED if is_skipped else LOST] = left[i]
-
-
-def _unusual(total: Ints, lags: Ints) -> Ints:
-    """Return by miss the unusual time of each cause."""
-    amounts: Ints = total[:, :len(CAUSES)].copy()
-    amounts[:, RELEASED_LATE] -= np.minimum(amounts[:, RELEASED_LATE], lags)
-    return amounts
-
-
-def _too_short(rows: Table, unusual: Ints, deadline: Ints) -> Any:
-    """Return which misses have a deadline that is shorter than the usual times."""
-    lateness = rows['until'] - rows['release'] - deadline
-    return (unusual == 0) | ((rows['kind'] == SINK_LATE) & (unusual < lateness))
 
 
 def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:

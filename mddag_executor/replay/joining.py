@@ -368,9 +368,13 @@ class Joined:
 
     def _set_end(self, found: Recording) -> None:
         """Find when judging begins and ends (rules 4 and 5)."""
-        judges_from = max(self._judging(), default=0)
-        if judges_from:
-            found.judge_from = judges_from
+        labels = {part.label for part in self._parts}
+        # without restarted processes, and those that have never judged
+        judging = [part.judges_from + part.shift for part in self._parts
+                   if 0 < part.judges_from < NEVER
+                   and part.label.partition('.')[0] not in labels - {part.label}]
+        if judging:
+            found.judge_from = max(judging)
         ends = [part.end + part.shift for part in self._parts if part.end is not None]
         end = max(int(part.seen_at.max(initial=0)) for part in self._parts)
         found.end = found.judged_until = min(end, NEVER - 1)
@@ -487,14 +491,6 @@ class Joined:
                 'from one to the other', 'give the traces of one run: ' + ', or '.join(
                     ' '.join(part.name for part in run) for run in runs)
                 + several * ' (or --offset, if clocks of machines differed)')
-
-    def _judging(self) -> Iterator[int]:
-        """Yield when processes begin to judge, if they ever do; without restarted ones."""
-        labels = {part.label for part in self._parts}
-        for part in self._parts:
-            if 0 < part.judges_from < NEVER and part.label.partition('.')[0] not in labels - {
-                    part.label}:
-                yield part.judges_from + part.shift
 
     def _placed(self) -> list[Process]:
         """Return the nodes of each process."""
