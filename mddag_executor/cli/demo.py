@@ -16,6 +16,7 @@ from collections.abc import Callable
 import json
 import os
 from pathlib import Path
+import shlex
 import sys
 from typing import Any
 
@@ -82,7 +83,7 @@ def _step(
     show: Callable[[str], None], result: Path, seconds: float | None, *words: str
 ) -> dict[str, Any]:
     """Run a command, show it and what it prints; return its result."""
-    show(f'\n$ mddag {" ".join(words)}')
+    show(f'\n$ mddag {shlex.join(words)}')
     sys.stdout.flush()
     # Of this machine only: the demo must not find another one's nodes, nor be found by them.
     done = run_program(

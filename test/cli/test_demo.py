@@ -37,8 +37,9 @@ def test_the_main_job_end_to_end(tmp_path, mddag):
 
 
 def test_a_step_that_fails_is_one_line(tmp_path, mddag):
-    (tmp_path / 'demo.mcap').mkdir()  # the trace cannot be written
-    process = mddag('demo', '--duration', '1s', '--output', tmp_path)
+    trace = tmp_path / 'a folder' / 'demo.mcap'
+    trace.mkdir(parents=True)  # it cannot be written
+    process = mddag('demo', '--duration', '1s', '--output', trace.parent)
     assert process.returncode == 2
-    assert process.stderr == (
-        f'error: mddag run: {tmp_path}/demo.mcap: this is a directory: name a file\n')
+    assert process.stderr == f'error: mddag run: {trace}: this is a directory: name a file\n'
+    assert f" --trace '{trace}' " in process.stdout  # as a shell needs it
