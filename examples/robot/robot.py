@@ -18,8 +18,6 @@ from array import array
 from collections import deque
 import math
 from pathlib import Path
-import threading
-import time
 
 from geometry_msgs.msg import Pose, PoseArray, PoseStamped, Twist
 from mddag_executor import MultiDeadlineExecutor
@@ -365,11 +363,8 @@ def main() -> None:
     nodes = make_nodes(given.scale)
     for node in nodes:
         executor.add_node(node)
-    thread = threading.Thread(target=executor.spin)
-    thread.start()
-    time.sleep(given.seconds)
+    executor.spin_until_future_complete(rclpy.Future(), given.seconds)
     executor.shutdown()
-    thread.join()
     statistics = executor.statistics()
     for node in nodes:
         for callback, log in getattr(node, 'log', {}).items():
