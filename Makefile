@@ -51,7 +51,7 @@ test: env
 
 # The tests that run ROS, in an environment with ROS 2 Kilted instead of Jazzy.
 LIVE_TESTS := test/executor test/hosting test/rerun test/examples test/hardening/test_misuse.py \
-	$(addprefix test/cli/test_,$(addsuffix .py,demo graph_systems rerun run top))
+	$(addprefix test/cli/test_,$(addsuffix .py,demo graph rerun run top))
 
 # With another rclpy than the index has: RCLPY is a folder with its package rclpy/, the extension
 # compiled against the headers of ros-jazzy-rclpy (in another environment: .ci/slim removes them).

@@ -66,6 +66,13 @@ def test_copyright():
     assert 'Apache License' in (TOP / 'LICENSE').read_text(encoding='utf-8')
 
 
+def test_the_makefile_names_tests_that_exist():
+    made = subprocess.run(['make', '-n', 'test-kilted', 'nightly', 'lint'], cwd=TOP, text=True,
+                          capture_output=True, check=True).stdout
+    tests = [word for word in made.split() if word.startswith('test/')]
+    assert len(tests) > 10 and [name for name in tests if not (TOP / name).exists()] == []
+
+
 def package_xml():
     return ElementTree.parse(TOP / 'package.xml').getroot()
 
