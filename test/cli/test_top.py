@@ -137,6 +137,8 @@ def test_live_in_a_terminal_until_the_user_ends_it(running):
             if shown.count(b'mddag: main') >= 3 and not ended:
                 ended = True
                 os.kill(pid, signal.SIGINT)
+    if not ended:
+        os.kill(pid, signal.SIGKILL)
     _, status = os.waitpid(pid, 0)
     os.close(terminal)
     assert os.waitstatus_to_exitcode(status) == 0
