@@ -53,6 +53,7 @@ from msg_graph import TaskSet
 from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
+from rclpy.node import Node
 from rclpy.utilities import get_default_context
 
 PATIENCE_S = 30.0
@@ -245,6 +246,8 @@ class Rerun:
                 sys.argv = arguments
                 if self._recorder is not None:
                     self._recorder.close(loop.now)
+                for node in self._holder.ordered_nodes():   # they would keep the context in use
+                    Node.destroy_node(node)
         for guest in self._host.guests:
             if guest.error is not None and not isinstance(guest.error, _ENDS):
                 loop.warn(

@@ -3,6 +3,8 @@
 """Nodes run again from a bag: what they see, what they publish, and when."""
 
 from functools import cached_property, partial
+import gc
+import os
 import random
 import threading
 import uuid
@@ -69,6 +71,17 @@ def published(result, topic):
     """Return what was published on a topic: when (ms after the start), and the message."""
     return [((each.time - START) / MS, deserialize_message(each.data, each.kind))
             for each in result.outputs if each.topic == topic]
+
+
+def test_the_middleware_is_left(bag, graph):
+    rerun(bag, graph, [Filter, Sink])   # the first one starts a thread that stays
+    before = len(os.listdir('/proc/self/task'))
+    gc.disable()
+    try:
+        rerun(bag, graph, [Filter, Sink])
+        assert len(os.listdir('/proc/self/task')) == before
+    finally:
+        gc.enable()
 
 
 def test_nodes_run_in_virtual_time(bag, graph):
