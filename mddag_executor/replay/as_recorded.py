@@ -7,7 +7,6 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-from mddag_executor.memory import give_back
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.chains import Chains
@@ -35,7 +34,6 @@ class Replay:
     def __init__(self, recording: Recording, skip: int = 0) -> None:
         self.recording, self.task_set = recording, recording.task_set
         self.judged = Judged(recording, skip)
-        give_back()
         self.tally = self.judged.tally
         self.warnings = list(recording.warnings)
         if self.judged.contradictions:
@@ -60,16 +58,12 @@ class Replay:
     @cached_property
     def usage(self) -> Usage:
         """Return how much time callbacks and workers used."""
-        found = Usage(self.recording, self._waited)
-        give_back()
-        return found
+        return Usage(self.recording, self._waited)
 
     @cached_property
     def explanation(self) -> Explanation:
         """Return the causes of missed deadlines."""
-        found = Explanation(self.recording, self.judged, self.chains)
-        give_back()
-        return found
+        return Explanation(self.recording, self.judged, self.chains)
 
     @cached_property
     def _waited(self) -> Any:
@@ -95,7 +89,6 @@ class Replay:
         """Return the result format of ``replay --json``."""
         recording, head, duration = self.recording, self.recording.head, self.duration_ns
         paths = Paths(recording).results()      # first, because they need the most memory
-        give_back()
         result = {
             'policy': head.policy, 'workers': head.workers, 'preemptive': head.preemptive,
             'duration_ns': duration,

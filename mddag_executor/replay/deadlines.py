@@ -48,6 +48,7 @@ from mddag_executor.core.state import (
     SINK_LATE,
     SINK_MISSED,
 )
+from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.tables import (
     in_parts,
@@ -133,6 +134,7 @@ class Judged:
             jobs, verdicts = self._judge(dag, releases[dag], completed, ends[dag])
             self.jobs.append(jobs)
             found += verdicts
+        give_back()     # memory of the completions
         table = np.concatenate([np.empty(0, dtype=VERDICTS), *found])
         found.clear()
         self.verdicts = pick(table, sort_by(table['order']))

@@ -54,7 +54,6 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple
 
-from mddag_executor.memory import give_back
 from mddag_executor.recording.tables import (
     different,
     EXECUTIONS,
@@ -164,7 +163,7 @@ class Paths:
         if not len(table):      # row -1 must exist
             table = rows(EXECUTIONS, 1, vertex=NONE, start=NONE, end=NONE)
         self._table = table
-        self._vertex = table['vertex'].copy()
+        self._vertex = table['vertex']
         if recording.callback_vertex:
             self._add_vertices(recording.callback_vertex)
         # by the index of a callback the rows of its executions
@@ -176,12 +175,12 @@ class Paths:
         self._of_topic: list[Ints] | None = None
         if recording.who.every_publisher or recording.links:
             self._published()
-        give_back()
         # messages that running callbacks took themselves, by execution
         self._took = self._first(recording.takes['execution']), recording.takes['message']
 
     def _add_vertices(self, of: dict[int, int]) -> None:
         """Find the declared callbacks of executions without job."""
+        self._vertex = self._vertex.copy()
         callbacks = np.array(sorted(of), dtype=np.int64)
         unknown = np.flatnonzero(self._vertex < 0)
         callback = self._recording.executions['callback'][unknown]
