@@ -14,15 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.recording.tables import (
-    LEG,
-    NOTHING,
-    REASONS,
-    Recording,
-    TABLES,
-    UNKNOWN,
-    VERTEX,
-)
+from mddag_executor.recording.tables import REASONS, Recording, TABLES, UNKNOWN
 import numpy as np
 
 VERSION = '1'
@@ -30,7 +22,8 @@ FILES = frozenset(f'{name}.parquet' for name in TABLES)
 """The files that ``write_tables`` writes."""
 _TIMES = {'release', 'noticed', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'time',
           'source_timestamp', 'deadline', 'completed'}
-_COMPLETES = {NOTHING: 'nothing', LEG: 'leg', VERTEX: 'vertex'}
+_COMPLETES = 'nothing', 'leg', 'vertex'
+"""Names of the values of ``completes``."""
 # Columns that are only used to build tables.
 _INNER = {'order'}
 
@@ -71,7 +64,7 @@ def _names(recording: Recording, table: str, column: str, values: Any) -> Any:
         names = list(recording.drop_reasons if table == 'drops' else REASONS)
         codes = values.astype(np.int32)
     elif column == 'completes':
-        names, codes = [_COMPLETES[each] for each in sorted(_COMPLETES)], values
+        names, codes = list(_COMPLETES), values
     else:
         return None
     known = codes >= 0

@@ -199,23 +199,14 @@ class Judged:
         for of, (_, kind) in _ENDS.items():
             kinds[reason == of] = kind
         at_end = min(judged_order, NEVER)
-        verdicts = []
         choices: tuple[tuple[Any, ...], ...] = (
             (done & here, np.where(late, SINK_LATE, SINK_IN_TIME), order, completed),
             (given_up, kinds[:, None], jobs.ended[:, None], jobs.until[:, None]),
             (dropped, SINK_DROPPED, np.minimum(jobs.ended, at_end)[:, None], dropped_at),
             (overdue, SINK_MISSED, at_end, judged_until))
-        for which, *columns in choices:
-            which = which & judged[:, None]
-            row, sink = np.nonzero(which)
-            if not len(row):
-                continue
-            verdict, at, until = (np.broadcast_to(each, done.shape)[which] for each in columns)
-            verdicts.append(recorded.rows(
-                VERDICTS, len(row), kind=verdict, dag=dag, sink=first + local[sink], row=row,
-                job=jobs.number[row], release=jobs.release[row], deadline=deadline[which],
-                until=until, order=at, completed=np.where(
-                    verdict <= max(SINK_COMPLETED), completed[which], -1)))
+        verdicts = [
+            _verdicts(dag, sinks, jobs, deadline, completed, which & judged[:, None], *columns)
+            for which, *columns in choices]
         outcome: Ints = np.where(
             ((late & here) | overdue | dropped).any(axis=1), LATE, COMPLETED)
         for of, (end, _) in _ENDS.items():
@@ -402,6 +393,21 @@ class Judged:
         recorded_misses = counted(len(before), 'recorded miss', 'recorded misses')
         return (f'the replay does not find {less.total()} of {recorded_misses}, and it finds '
                 f'{more.total()} that were not recorded: the first is job {example[2]} at {name}')
+
+
+def _verdicts(
+    dag: int, sinks: list[int], jobs: Jobs, deadline: Ints, completed: Ints, which: Mask,
+    kind: Any, order: Any, until: Any,
+) -> Table:
+    """Return some verdicts, a table of ``VERDICTS``; all columns are by job and sink."""
+    row, sink = np.nonzero(which)
+    kind, order, until = (
+        np.broadcast_to(each, which.shape)[which] for each in (kind, order, until))
+    return recorded.rows(
+        VERDICTS, len(row), kind=kind, dag=dag, sink=np.array(sinks, dtype=np.int64)[sink],
+        job=jobs.number[row], release=jobs.release[row], deadline=deadline[which],
+        completed=np.where(kind <= max(SINK_COMPLETED), completed[which], -1), until=until,
+        row=row, order=order)
 
 
 def _completions(executions: Table, n_dags: int) -> list[list[Table]]:
