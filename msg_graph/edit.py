@@ -54,24 +54,16 @@ def _refused(name: str) -> GraphError:
                       'write anchors, quotes and multi-line texts more plainly')
 
 
-def load_with_or_without_deadlines(text: str, name: str) -> tuple[TaskSet, list[str]]:
-    """
-    Return the task set of a declaration whose sinks may lack deadlines.
-
-    :return: the task set, and the keys of the callbacks without a deadline, which get 1 s.
-    """
+def load_with_or_without_deadlines(text: str, name: str, path: str | None = None) -> TaskSet:
+    """Return the task set of a declaration, see ``loads``; sinks without a deadline get 1 s."""
     missing: list[str] = []
-    task_set = loads(text, name, without_deadline=missing)
-    return with_deadlines(task_set, dict.fromkeys(missing, SECOND)), missing
+    task_set = loads(text, name, path, without_deadline=missing)
+    return with_deadlines(task_set, dict.fromkeys(missing, SECOND))
 
 
-def deadlines_in_text(task_set: TaskSet, text: str, deadlines: Table[str, int]) -> str:
-    """Return a declaration with other deadlines (by key, ns); comments and order stay."""
-    try:
-        result = _with_deadlines(text, deadlines)
-    except KeyError:  # the declaration has several files
-        raise _refused(task_set.file) from None
-    return checked(result, with_deadlines(task_set, deadlines))
+def deadlines_in_text(task_set: TaskSet, deadlines: Table[str, int]) -> str:
+    """Return the text of a declaration with other deadlines (by key, ns)."""
+    return checked(_with_deadlines(task_set.text, deadlines), with_deadlines(task_set, deadlines))
 
 
 def callbacks_of(declaration: Any) -> Iterator[tuple[str, Any, dict[str, Any]]]:

@@ -21,12 +21,13 @@ EXAMPLE = """\
 mddag graph assign-deadlines graph.yaml -o assigned.yaml
 mddag graph assign-deadlines graph.yaml --target 0.95 --runs 2000 -o assigned.yaml"""
 DESCRIPTION = """\
-Give each sink a relative deadline; comments, order and all else of the declaration stay, and sinks
-without a deadline are accepted. The deadlines are in proportion to the critical paths: the sink of
-a DAG with the longest path gets the DAG's period, the others less. With --target they are the
-critical paths times one scale, the tightest at which the simulated acceptance stays above the
-target, with the lower end of its 95 % confidence interval. Either way the acceptance of the result
-is measured and reported; after a search with other draws of execution times."""
+Give each sink a relative deadline; comments, order and all else of the declaration stay (one that
+includes others becomes one file), and sinks without a deadline are accepted. The deadlines are in
+proportion to the critical paths: the sink of a DAG with the longest path gets the DAG's period,
+the others less. With --target they are the critical paths times one scale, the tightest at which
+the simulated acceptance stays above the target, with the lower end of its 95 % confidence
+interval. Either way the acceptance of the result is measured and reported; after a search with
+other draws of execution times."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,9 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     from msg_graph.edit import deadlines_in_text, load_with_or_without_deadlines
     name, text = common.read_text(args.graph)
-    task_set, _ = load_with_or_without_deadlines(text, name)
+    task_set = load_with_or_without_deadlines(text, name, None if args.graph == '-' else name)
     deadlines, measured, found = _assign(args, task_set)
-    common.write_text(args.output, deadlines_in_text(task_set, text, deadlines))
+    common.write_text(args.output, deadlines_in_text(task_set, deadlines))
     result: dict[str, Any] = {
         'policy': args.policy, 'budget': args.budget, 'deadlines_ns': deadlines,
         'acceptance': measured.result()}

@@ -42,23 +42,23 @@ nodes:
 def test_only_the_values_change():
     task_set = loads(TEXT)
     new = {'/n:x': 1_234_000, '/n:y': 2_000_000_000, '/n:z': 3_141}
-    result = deadlines_in_text(task_set, TEXT, new)
+    result = deadlines_in_text(task_set, new)
     assert result == TEXT.replace('5 ms', '1.234ms').replace('"50ms"', '2s').replace(
         '7ms', '3.141us')
     assert without_lines(loads(result)) == without_lines(with_deadlines(task_set, new))
     # Two deadlines that are one in the text cannot differ.
     text = TEXT.replace('"50ms"', '&d 50ms').replace('7ms', '*d')
     with pytest.raises(GraphError, match='without a change of its meaning'):
-        deadlines_in_text(loads(text), text, {'/n:y': 9_000_000, '/n:z': 8_000_000})
+        deadlines_in_text(loads(text), {'/n:y': 9_000_000, '/n:z': 8_000_000})
 
 
 def test_missing_deadlines():
     text = TEXT.replace(', deadline: 5 ms', '').replace('      deadline: "50ms"   # quoted\n', '')
     text = text.replace('      deadline: 7ms\n', '')
-    task_set, missing = load_with_or_without_deadlines(text, 'g.yaml')
-    assert (task_set.file, missing) == ('g.yaml', ['/n:x', '/n:y', '/n:z'])
+    task_set = load_with_or_without_deadlines(text, 'g.yaml')
+    assert [callback.deadline_ns for callback in task_set.callbacks] == [None, *[10 ** 9] * 3]
     result = deadlines_in_text(
-        task_set, text, {'/n:x': 5_000_000, '/n:y': 50_000_000, '/n:z': 7_000_000})
+        task_set, {'/n:x': 5_000_000, '/n:y': 50_000_000, '/n:z': 7_000_000})
     assert without_lines(loads(result)) == without_lines(loads(TEXT))
     # What was there stays as it was.
     left = iter(result.splitlines())
@@ -68,6 +68,15 @@ def test_missing_deadlines():
                            (text.replace('timer: 20ms', 'timer: 20'), "'20' has no unit")):
         with pytest.raises(GraphError, match=problem):
             load_with_or_without_deadlines(wrong, 'g.yaml')
+
+
+def test_what_includes_others_becomes_one_file(tmp_path):
+    (tmp_path / 'part.yaml').write_text(TEXT.replace(', deadline: 5 ms', ''))
+    text = 'mddag: 1\ninclude: [{file: part.yaml, namespace: /a}]\n'
+    task_set = load_with_or_without_deadlines(text, 'top', str(tmp_path / 'top.yaml'))
+    again = loads(deadlines_in_text(task_set, {'/a/n:x': 5_000_000}))
+    assert [c.deadline_ns for c in again.callbacks] == [
+        None, 5_000_000, 50_000_000, 7_000_000]
 
 
 def test_autoware_with_other_deadlines():
