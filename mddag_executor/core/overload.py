@@ -26,7 +26,6 @@ from mddag_executor.core.state import (
     N_STALE,
     OPEN,
     PREEMPTIVE,
-    QueueEntry,
     REFUSES,
     SINK_DEMOTED,
     START_KEYS,
@@ -58,8 +57,9 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
     key = s.x_key[x]
     vertex = s.x_vertex[x]
     demoted = s.demoted[vertex]
-    while demoted and _is_over(s, demoted[0]):
-        heappop(demoted)
+    while demoted and (s.x_state[demoted[0][4]] != WAITING
+                       or s.x_key[demoted[0][4]][3] != demoted[0][0]):
+        heappop(demoted)  # it has started or was dropped
         if len(demoted) == 0:
             set_start(t, s, vertex)
     if s.urged[vertex] == key[3]:
@@ -80,12 +80,6 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
     s.urged[vertex] = s.x_key[first][3]
     _change_key(s, first, key[0])
     return True
-
-
-def _is_over(s: State, entry: QueueEntry) -> bool:
-    """Return whether a demoted execution has started or was dropped."""
-    x = entry[4]
-    return s.x_state[x] != WAITING or s.x_key[x][3] != entry[0]
 
 
 def _change_key(s: State, x: int, priority: int) -> None:

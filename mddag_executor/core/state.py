@@ -200,6 +200,7 @@ def fill_state(
         s.mean.append(t.mean_time[v])
         s.holder.append(0)
         s.next_miss.append(0)
+        s.expected.append(HERE)
         for _ in range(t.tolerated[v]):
             s.missed_jobs.append(-NEVER)
     for i in range(len(t.reach_start)):
@@ -221,8 +222,6 @@ def fill_state(
         s.next_release.append(-NEVER)
         s.interpreter_time.append(0)
         s.partial.append(0)
-    for _ in range(t.n_vertices + 1):
-        s.expected.append(HERE)
 
 
 def add_slot(t: Tables, s: State, dag: int) -> None:

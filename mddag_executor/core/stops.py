@@ -57,15 +57,10 @@ class Stops:
         self._count += 1
         self._total_ns += end - begin
         self._latest.append((begin, end))
-        waiting, self._unexplained = self._unexplained, deque(maxlen=KEEP_MISSES)
-        found = []
-        for miss in waiting:
-            if miss.is_explained_by(begin, end):
-                found.append(miss.what)
-            else:
-                self._unexplained.append(miss)
-        self._misses += len(found)
-        return found
+        waiting = [(miss.is_explained_by(begin, end), miss) for miss in self._unexplained]
+        self._unexplained = deque((miss for is_one, miss in waiting if not is_one), KEEP_MISSES)
+        self._misses += sum(is_one for is_one, _ in waiting)
+        return [miss.what for is_one, miss in waiting if is_one]
 
     def missed(self, release: int, deadline: int, completed: int, what: Any = None) -> bool:
         """

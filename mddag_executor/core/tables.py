@@ -170,8 +170,8 @@ class _Columns:
         self._groups: dict[tuple[str, str], int] = {}
         self._entities: dict[str, int] = {}
         self._n_entities = 0
-        self._chains: list[tuple[int, ...]] = []
-        self._keys: list[str] = []
+        # the callback of each vertex, and its most urgent chain
+        self._chains: list[tuple[str, tuple[int, ...]]] = []
         names = [n for n in Tables._fields if n not in (
             'n_dags', 'n_vertices', 'n_groups', 'n_entities')]
         self.lists: dict[str, list[int]] = {name: [] for name in names}
@@ -193,11 +193,10 @@ class _Columns:
         for index in reversed(topological_order(dag)):
             heights[index] = 1 + max((heights[s] for s in dag.vertices[index].successors),
                                      default=-1)
-        self._keys += [vertex.callback.key for vertex in dag.vertices]
-        lateness = path_lengths(dag, [1] * len(dag.vertices))
         self._chains += [
-            (offset, dag.period_ns, dag.index, -late, index)
-            for index, (offset, late) in enumerate(zip(rad_offsets(dag), lateness))]
+            (vertex.callback.key, (offset, dag.period_ns, dag.index, -late, vertex.index))
+            for vertex, offset, late in zip(
+                dag.vertices, rad_offsets(dag), path_lengths(dag, [1] * len(dag.vertices)))]
         region = 0
         for vertex, sinks in zip(dag.vertices, reached):
             countdown, topics = len(vertex.predecessors), [0]
@@ -271,7 +270,7 @@ class _Columns:
         }
         for name, value in undeclared.items():
             lists[name].append(value)
-        self._chains.append((default_deadline, default_deadline, n_dags, 0, 0))
+        self._chains.append(('', (default_deadline, default_deadline, n_dags, 0, 0)))
         lists['chain_rank'] = self._ranks()
         return Tables(
             n_dags=n_dags, n_vertices=n_vertices, n_groups=len(self._groups),
@@ -279,12 +278,11 @@ class _Columns:
 
     def _ranks(self) -> list[int]:
         """Return the rank of each vertex's callback, by its most urgent vertex."""
-        keys = [*self._keys, '']  # the last is the undeclared one
         best: dict[str, tuple[int, ...]] = {}
-        for key, chain in zip(keys, self._chains):
+        for key, chain in self._chains:
             best[key] = min(chain, best.get(key, chain))
         ranks = {key: rank for rank, key in enumerate(sorted(best, key=lambda key: best[key]))}
-        return [ranks[key] for key in keys]
+        return [ranks[key] for key, _ in self._chains]
 
 
 def processes_of(task_set: TaskSet) -> list[int]:

@@ -161,7 +161,7 @@ class Announcements:
         if len(message.data) % _ENTRY.size:
             return
         for entry in _ENTRY.iter_unpack(message.data):
-            self._take_in(*entry)
+            self._note(*entry)
         for entry in list(self._waiting):
             origin = self._find(entry[1], entry[2])
             if origin is not None:
@@ -178,7 +178,7 @@ class Announcements:
             release, stamp = stamped_release(work.args[0], self._clock)
         self._engine.arrived(work, origin, release, stamp, now)
 
-    def _take_in(
+    def _note(
         self, whose: int, of: int, sequence: int, begin: int, end: int, home: int, number: int,
         release: int, dag: int, vertex: int, topic: int,
     ) -> None:
@@ -187,7 +187,7 @@ class Announcements:
             self._publishers[whose, of] = publisher  # the latest is last
             if len(self._publishers) > REMEMBERED:
                 del self._publishers[next(iter(self._publishers))]
-            self._jobs.take_in(self._topics[topic], Publication(
+            self._jobs.note_announced(self._topics[topic], Publication(
                 begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
 
     def _find(

@@ -60,24 +60,21 @@ def message_taker(subscription: Any) -> Callable[[], tuple[Any, dict[str, Any]] 
 
 def request_taker(service: Any) -> Callable[[], tuple[Any, Any] | None]:
     """Return a function that takes a request with its header, or returns None."""
-    take, kind = service.handle.service_take_request, service.srv_type.Request
-
-    def take_request() -> tuple[Any, Any] | None:
-        taken: tuple[Any, Any] = take(kind)
-        return None if taken[1] is None else taken
-
-    return take_request
+    return _taker(service.handle.service_take_request, service.srv_type.Request)
 
 
 def response_taker(client: Any) -> Callable[[], tuple[Any, Any] | None]:
     """Return a function that takes a response's header and the response, or returns None."""
-    take, kind = client.handle.take_response, client.srv_type.Response
+    return _taker(client.handle.take_response, client.srv_type.Response)
 
-    def take_response() -> tuple[Any, Any] | None:
-        taken: tuple[Any, Any] = take(kind)
+
+def _taker(take: Callable[[Any], tuple[Any, Any]], kind: Any) -> Callable[
+        [], tuple[Any, Any] | None]:
+    def take_one() -> tuple[Any, Any] | None:
+        taken = take(kind)
         return None if taken[0] is None else taken
 
-    return take_response
+    return take_one
 
 
 callback_type: Callable[[Any], Any] = attrgetter('_callback_type')

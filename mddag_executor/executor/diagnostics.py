@@ -91,10 +91,10 @@ class DagWatch:
         self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
         # the counters at the end of each period of the window, and before it
-        self._seen = deque([self._look()], maxlen=thresholds.window + 1)
+        self._seen = deque([self._read()], maxlen=thresholds.window + 1)
         self._released_at: int | None = None
 
-    def _look(self) -> _Seen:
+    def _read(self) -> _Seen:
         sinks = self._sinks.values()
         return _Seen(
             Counts.total(counts(sink.verdicts()) for sink in sinks),
@@ -103,7 +103,7 @@ class DagWatch:
 
     def status(self, now: int) -> Status:
         """Return the status; called once a period (``now``: monotonic ns)."""
-        last, seen = self._seen[-1], self._look()
+        last, seen = self._seen[-1], self._read()
         self._seen.append(seen)
         if seen.jobs != last.jobs:
             self._released_at = now

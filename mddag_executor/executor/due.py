@@ -259,9 +259,6 @@ class Muting:
         self._bound = 0
         self._patience = pool.engine.tables.rad_offset[-1]
         self._pool = pool
-        self._engine = pool.engine
-        self._loop = pool.loop
-        self._timers = pool.timers
 
     def update(self, now: int) -> None:
         """Mute sources whose callbacks cannot start while the dispatched one holds the GIL."""
@@ -270,19 +267,19 @@ class Muting:
             for entity in list(self.entities):
                 if entity.classify is not None:
                     entity.classify()
-        bound, until = self._engine.overtaking_bound(now)
+        bound, until = self._pool.engine.overtaking_bound(now)
         if not 0 < bound <= self._patience:
             self.end()
         else:
             self.until, self._bound = until, bound
-            self._loop.mute()
+            self._pool.loop.mute()
 
     def end(self) -> None:
         """End muting, and collect arrivals; timers only if callbacks may start."""
         if not self.until:
             return
         self.until = self._bound = 0
-        for source in self._loop.sources(self._loop.unmute()):
+        for source in self._pool.loop.sources(self._pool.loop.unmute()):
             source.collect()
         if self._pool.running:
             self._pool.fire_timers()
@@ -294,15 +291,15 @@ class Muting:
         if not habit.is_known:
             return
         entity.is_nested = habit.computes
-        is_patient = self._engine.relative_deadline(entity) >= self._patience
-        self._loop.move(source, is_patient and self._has_long and bool(habit.computes))
+        is_patient = self._pool.engine.relative_deadline(entity) >= self._patience
+        self._pool.loop.move(source, is_patient and self._has_long and bool(habit.computes))
 
     def next_timer(self) -> int:
         """Return when the next timer that could start is due (monotonic ns); 0: never."""
-        return self._timers.next_due_of(self._could_start) if self.until else (
-            self._timers.next_due())
+        return self._pool.timers.next_due_of(self._could_start) if self.until else (
+            self._pool.timers.next_due())
 
     def _could_start(self, entity: Entity) -> bool:
         habit = entity.habit
         return (not habit.computes or not habit.is_known
-                or self._engine.relative_deadline(entity) < self._bound)
+                or self._pool.engine.relative_deadline(entity) < self._bound)

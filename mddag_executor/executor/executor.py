@@ -494,7 +494,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._at_once.ring()
 
     def _raise_error(self) -> None:
-        self._unclaimed.look()
+        self._unclaimed.check()
         while self._errors:
             error = self._errors.popleft()
             # else it was raised only because a callback has ended the context

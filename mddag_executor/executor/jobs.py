@@ -271,7 +271,7 @@ class Jobs:
         for name, topic in self.topics.items():
             topic.is_announced = name in topics
 
-    def take_in(self, topic: str, publication: Publication) -> None:
+    def note_announced(self, topic: str, publication: Publication) -> None:
         """Note a publication that another process has announced."""
         self.topics[topic].announced.append(publication)
 

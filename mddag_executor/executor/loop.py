@@ -34,10 +34,6 @@ _EDGE = select.EPOLLIN | select.EPOLLET
 Events = list[tuple[int, int]]
 
 
-def _no_events(timeout: float = -1) -> Events:
-    return []
-
-
 class ChannelSource:
     """
     Anything that announces arrivals by a descriptor.
@@ -206,7 +202,7 @@ class EventLoop:
         fds = [*self._free, self._bell, self._leave, self.timer.fd]
         self._bell = self._leave = self.timer.fd = -1
         self._free.clear()
-        self.wait = _no_events
+        self.wait = lambda *_: []
         for fd in fds:
             if fd >= 0:
                 os.close(fd)

@@ -27,7 +27,7 @@ from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.work import current, QuickCallback, TaskWork, Work
 from rclpy.task import Future
 
-LOOK_S = 0.05
+CHECK_S = 0.05
 """How often to check whether a callback still runs that has created a failed task."""
 
 
@@ -36,29 +36,29 @@ class ObservedTask(BareTask):
     A task that knows whether it is observed, so that its exception is handled.
 
     :ivar maker: the execution whose callback has created it, or None.
-    :ivar put_by: receives a deferred exception that was not handled.
+    :ivar deferred_to: receives a deferred exception that was not handled.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.observed = False
         running = current.running
         self.maker: Work | None = None if running is None else running.work
-        self.put_by: Callable[[BaseException], None] | None = None
+        self.deferred_to: Callable[[BaseException], None] | None = None
         super().__init__(*args, **kwargs)
 
     def __del__(self) -> None:
         """Report a deferred exception: it cannot be handled any more."""
-        if self.put_by is not None:
-            self.give_out()
+        if self.deferred_to is not None:
+            self.report()
         super().__del__()  # type: ignore[no-untyped-call]
 
     def unclaimed(self) -> BaseException | None:
         """Return the exception if it is not handled."""
         return None if self.observed else self.unfetched()
 
-    def give_out(self) -> None:
+    def report(self) -> None:
         """Report a deferred exception, unless it has been handled."""
-        report, self.put_by = self.put_by, None
+        report, self.deferred_to = self.deferred_to, None
         error = self.unclaimed()
         if error is not None and report is not None:
             self.mark_fetched()
@@ -75,7 +75,7 @@ class Unclaimed:
     The exceptions of tasks that are not handled yet.
 
     :param fail: receives those that remain unhandled.
-    :param ring: called when there is a task to ``look`` at.
+    :param ring: called when there is a task to ``check``.
     """
 
     def __init__(
@@ -96,15 +96,15 @@ class Unclaimed:
             task.mark_fetched()
             raise error
         forget_task_frames(error)  # else the task refers to itself
-        task.put_by = self._fail
+        task.deferred_to = self._fail
         self._tasks.append(weakref.ref(task))
         self._ring()
 
     def rest_s(self) -> float | None:
-        """Return the seconds until the next ``look``; None: there are no tasks."""
-        return LOOK_S if self._tasks else None
+        """Return the seconds until the next ``check``; None: there are no tasks."""
+        return CHECK_S if self._tasks else None
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Report the exceptions of tasks whose makers have ended."""
         for _ in range(len(self._tasks)):
             reference = self._tasks.popleft()
@@ -112,7 +112,7 @@ class Unclaimed:
             if task is None or task.unclaimed() is None:
                 continue
             if task.maker is None or task.maker.x < 0:
-                task.give_out()
+                task.report()
             else:
                 self._tasks.append(reference)
 

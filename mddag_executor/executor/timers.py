@@ -86,7 +86,7 @@ class TimerSource(EntitySource):
     def collect(self) -> None:
         """Ask rcl when it is due, as it was reset."""
         if self.fd >= 0:  # else it was removed after its arrival was found
-            self._queue.look_at(self)
+            self._queue.ask(self)
 
     def next_due(self) -> int | None:
         """Return the time of its next call by rcl, monotonic ns; None while it is cancelled."""
@@ -146,7 +146,7 @@ class TimerQueue:
         self._timers[id(source)] = source
         if source.may_be_simulated:
             self._watch(source.timer.clock)
-        self.look_at(source)
+        self.ask(source)
 
     def remove(self, source: TimerSource) -> None:
         """Remove a timer."""
@@ -201,15 +201,15 @@ class TimerQueue:
         return min((due for due, entry, source in self._heap
                     if source.entry == entry and wanted(source.entity)), default=0)
 
-    def look_at(self, source: TimerSource) -> None:
+    def ask(self, source: TimerSource) -> None:
         """Ask rcl when a timer is due that is new or was reset."""
         try:
             with source.handle:
-                self._look_at(source)
+                self._ask(source)
         except RCL_ERRORS as error:
             self._failed(source, error)
 
-    def _look_at(self, source: TimerSource) -> None:
+    def _ask(self, source: TimerSource) -> None:
         source.simulated = source.is_simulated()
         if source.simulated:
             source.entry = 0
@@ -237,7 +237,7 @@ class TimerQueue:
             self.has_jumped = False
             for source in list(self._timers.values()):
                 if source.may_be_simulated:
-                    self.look_at(source)
+                    self.ask(source)
         heap = self._heap
         last = self._entries  # an entry made meanwhile is of the next round
         while heap and heap[0][1] <= last and heap[0][0] <= _now():

@@ -214,32 +214,6 @@ def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_mo
     assert engine.dispatch(1, 1) is messages[0]
 
 
-def test_a_message_costs_as_much_when_many_wait(monkeypatch):
-    """The lock is held meanwhile: else a fast foreign publisher would starve the jobs."""
-    checked, reads = [], []
-    monkeypatch.setattr('mddag_executor.executor.engine.is_late', lambda *args: checked.append(1))
-    full = OneUser(depth=100, on_late='demote')
-    origins = [full.publish(time) for time in range(110)]
-    for origin in origins:
-        full.hear(origin, 110)
-    assert (len(checked), full.user.dropped) == (10, 10)
-
-    class Keys(list):
-        def __getitem__(self, x):
-            reads.append(x)
-            return super().__getitem__(x)
-
-    one = OneUser()
-    one.engine._core()
-    one.engine._state.x_key = Keys(one.engine._state.x_key)
-    costs = []
-    for time in range(300):
-        reads.clear()
-        one.engine.arrived(Work(one.user, print), None, -1, -1, time)
-        costs.append(len(reads))
-    assert len(one.user.waiting) == 300 and 0 < costs[-1] == costs[10]
-
-
 @examples(150)
 @given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
 def test_nothing_waits_that_may_run_during_a_computing_callback(steps):

@@ -287,7 +287,7 @@ def test_it_never_guesses(steps, data):
 
 
 def announced(bench, begin, end, number, sequence, publisher):
-    bench.jobs.take_in(TOPIC, Publication(
+    bench.jobs.note_announced(TOPIC, Publication(
         begin, publisher, Announced((1, number), 0, 0, 0), sequence, end))
 
 

@@ -167,7 +167,7 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('subscriptions_that_publishing_threads_took_from_stay_silent', [
         ('executor/loop.py', 'self._set_mask(sources, _EDGE)', 'pass'),
         # which would register them again
-        ('executor/due.py', 'self._loop.move(source', '(source')], of(
+        ('executor/due.py', 'self._pool.loop.move(source', '(source')], of(
         'test_delivery.py',
         'test_messages_of_this_process_and_of_another_one_come_all_and_in_order')),
     Case('resets_of_timers_not_noticed', [(
