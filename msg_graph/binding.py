@@ -128,7 +128,7 @@ def is_period(period_ns: int, declared_ns: int) -> bool:
     return abs(declared_ns - period_ns) <= _PERIOD_TOLERANCE * declared_ns
 
 
-def meant(callback: Callback, undeclared: Collection[Entity]) -> str | None:
+def suggest_entity(callback: Callback, undeclared: Collection[Entity]) -> str | None:
     """
     Return the entity that an unbound declared callback probably means, as a question.
 

@@ -54,12 +54,12 @@ from msg_graph.declaration import parse_declaration
 from msg_graph.draft import open_blanks
 from msg_graph.errors import (
     Collector,
+    combine_errors,
     did_you_mean,
     for_each,
     GraphError,
     listed,
     shown,
-    together,
 )
 from msg_graph.language import CALLBACK_KEYS, Entry
 from msg_graph.model import Callback, Dag, Path, QueueEdge, TaskSet, Vertex
@@ -112,7 +112,7 @@ def loads(
                 without_deadline)
     except GraphError as error:
         blanks = open_blanks(text, name)
-        raise (together(blanks) if blanks else error) from None
+        raise (combine_errors(blanks) if blanks else error) from None
 
 
 @contextmanager

@@ -17,7 +17,7 @@ The rules are the same for live runs and recordings. Observations are counts by 
    are not checked, because a declaration does not say how messages are joined.
 4. *never ran*: a callback never ran and got nothing, or a sync never got one of its topics, but
    should have run at least twice. The report suggests an undeclared entity that may be meant
-   (``binding.meant``).
+   (``binding.suggest_entity``).
 5. A callback may run in another process if all its DAGs may span processes (``release_from:
    header_stamp``) or the declaration has ``processes:``, and its node was not seen here. Then it
    is not reported.
@@ -31,7 +31,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from msg_graph.binding import Entity, is_background, meant
+from msg_graph.binding import Entity, is_background, suggest_entity
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
 from msg_graph.model import Callback, Dag, legs_of, TaskSet, topological_order
@@ -177,7 +177,7 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
         return None     # the callbacks before it, or its own executions, were late or dropped
     text = (f'{callback.key} never {"ran" if topic is None else f"got a message of {topic}"} in '
             f'{observed.duration_ns / 1e9:.3f} s')
-    question = meant(
+    question = suggest_entity(
         callback if topic is None else replace(callback, kind='subscription', topics=(topic,)),
         observed.undeclared)
     return Drift('never ran', callback.key, topic, None, 0,

@@ -63,7 +63,7 @@ class ValueProblem(ValueError):
         return f'{self.problem}: {self.remedy}'
 
 
-def together(errors: Sequence[GraphError]) -> GraphError:
+def combine_errors(errors: Sequence[GraphError]) -> GraphError:
     """Return several errors, at least one, as one."""
     first = errors[0]
     return first if len(errors) == 1 else GraphError(
@@ -95,7 +95,7 @@ class Collector:
     def check(self) -> None:
         """End a stage: the next one would only find consequences of these errors."""
         if self._errors:
-            raise together(self._errors[:MOST_ERRORS])
+            raise combine_errors(self._errors[:MOST_ERRORS])
 
 
 def for_each(items: Iterable[T], work: Callable[[T], R]) -> list[R]:

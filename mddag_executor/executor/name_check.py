@@ -8,7 +8,7 @@ Theory of operation
 A declaration names nodes and topics.  If a program uses different names (a namespace, a remapping,
 a typing error), its callbacks run without any verdict.  Two periods after the executor began to
 judge, but not before ``LEAST_S``, a warning lists the declared callbacks that no entity is bound
-to, each with the undeclared one that may be meant (``msg_graph.binding.meant``), and the
+to, each with the undeclared one that may be meant (``msg_graph.binding.suggest_entity``), and the
 undeclared callbacks that have run.  There is no warning while the executor has no nodes, and none
 of callbacks that may run in another process (``msg_graph.drift``).
 """
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from mddag_executor.executor.entity import SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.text import counted, listed
 from msg_graph import Callback, TaskSet
-from msg_graph.binding import is_background, meant
+from msg_graph.binding import is_background, suggest_entity
 from msg_graph.drift import dags_of, may_run_elsewhere
 from msg_graph.errors import printable
 from rclpy.logging import get_logger
@@ -83,7 +83,7 @@ def unbound_text(task_set: TaskSet, missing: list[Callback], registry: Registry)
     others = registry.undeclared()
     names = []
     for callback in missing:
-        question = meant(callback, others)
+        question = suggest_entity(callback, others)
         names.append(callback.key if question is None else f'{callback.key} ({question})')
     found = counted(len(missing), 'declared callback was', 'declared callbacks were')
     text = f'{task_set.file}: {found} found in no node: {listed(names)}'

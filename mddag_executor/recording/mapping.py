@@ -40,7 +40,7 @@ from mddag_executor.recording.tables import Recording, Table
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
 from msg_graph import Dag, NO_GRAPH, TaskSet, Vertex
-from msg_graph.binding import Binder, entities_of, Entity, meant
+from msg_graph.binding import Binder, entities_of, Entity, suggest_entity
 import numpy as np
 
 
@@ -159,7 +159,7 @@ def report_missing(
     absent = [callback for callback in judge.callbacks if callback.key not in found]
     if not absent:
         return []
-    questions = ((c.key, meant(c, others)) for c in absent)
+    questions = ((c.key, suggest_entity(c, others)) for c in absent)
     question = next((f'{key}: {each}' for key, each in questions if each is not None), None)
     if len(absent) == len(judge.callbacks):
         has = f'it has {listed(known)}' if known else 'it does not say what its callbacks are'

@@ -5,7 +5,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 from msg_graph import loads
-from msg_graph.binding import Binder, entities_of, Entity, entity_name, meant
+from msg_graph.binding import Binder, entities_of, Entity, entity_name, suggest_entity
 from msg_graph.drift import drift, Observed, Releases
 import pytest
 
@@ -195,7 +195,8 @@ def test_every_callback_can_be_bound_once():
     ('/b:s', Entity('/robot/b', 'service', '/x'), None),
 ])
 def test_a_namespace_more_or_another_period_is_probably_meant(callback, seen, meaning):
-    found = meant(BOUND.callback(callback), [Entity('/other', seen.kind, '/z', 1000), seen])
+    others = [Entity('/other', seen.kind, '/z', 1000), seen]
+    found = suggest_entity(BOUND.callback(callback), others)
     assert found == (meaning and f'did you mean {meaning}?')
 
 
