@@ -5,6 +5,7 @@
 import re
 
 from mddag_executor.recording.head import declared, Head
+from mddag_executor.recording.tables import ALL_LEGS, VERTEX
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run import open_recording
 from mddag_executor.report.replays import times_tables
@@ -102,6 +103,47 @@ def test_the_chain_of_a_job_goes_through_what_it_waited_for(trace):
     assert (use['completed'], use['late'], use['response_ns']['max']) == (1, 0, 6 * MS)
     assert {key: time for key, time in use['breakdown']['mean'].items() if time} == {
         'waiting_ns': 2 * MS, 'executing_ns': 3 * MS, 'suspended_ns': MS}
+
+
+def test_a_chain_ends_where_no_publisher_had_started(trace):
+    trace.release(1, 0, 30)
+    trace.run(1, 1, 0, 34, 35, ready=33)
+    trace.run(1, 0, 0, 36, 37)
+    worst = replay(trace.end(110)).result()['dags']['/imu']['sinks']['/imu:use']['breakdown'][
+        'worst']
+    assert (chain_of(worst), worst['unknown_ns']) == (['/imu:use'], 3 * MS)
+
+
+def test_what_ran_after_the_end_of_a_job_does_not_explain_its_miss(trace):
+    trace.release(0, 0, 10)
+    for vertex, start, end in ((0, 10, 12), (1, 12, 14), (2, 14, 17)):
+        trace.run(0, vertex, 0, start, end, ready=min(start, 12))
+    trace.piece(0, 4, 0, 18, 19)        # which message started it is not recorded
+    trace.add('expire', 30, 0, 0)
+    trace.piece(0, 4, 0, 40, 41)
+    trace.release(1, 0, 30)
+    trace.run(1, 0, 0, 52, 53)
+    trace.add('shutdown', 60, ns(50))   # until then it was judged
+    trace.file.finish()
+    jobs = replay(trace.path).explanation.result()['jobs']
+    assert {each['sink']: list(dict.fromkeys(part['vertex'] for part in each['parts']))
+            for each in jobs} == {
+        '/fuse:join': ['/camera:grab', '/right:rectify', '/fuse:join'],
+        '/right:watch': ['/camera:grab', '/right:watch'], '/imu:use': ['/imu:tick']}
+    assert [each['sink'] for each in jobs for part in each['parts']
+            if part['cause'] == 'lost'] == ['/right:watch', '/imu:use']
+    assert all(sum(part['ns'] for part in each['parts']) == each['until_ns'] - each['release_ns']
+               for each in jobs)
+
+
+def test_legs_that_complete_at_once_may_be_in_several_batches(trace, monkeypatch):
+    monkeypatch.setattr(reading, '_BATCH_BYTES', 1)
+    trace.piece(0, 4, 0, 10, 12)
+    for leg in range(2):
+        trace.add('complete', 12, 1004, 0, 4, 0, leg == 1, ns(12), leg, thread=10)
+        trace.file.flush()
+    table = open_recording(trace.end(110)).executions
+    assert table[['leg', 'completes']].tolist() == [(ALL_LEGS, VERTEX)]
 
 
 def test_the_first_end_of_the_dispatched_callback_ends_it(trace, monkeypatch):
