@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes and entities come and go: nothing of them is kept, and what stays loses nothing."""
 
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import gc
@@ -161,39 +162,22 @@ class Brief:
             self.executor.remove_node(node)
 
 
-def sizes(*owners):
-    """Return the sizes of everything that these have, and of what that has."""
-    found = {}
-    for owner in owners:
-        attributes = [*getattr(owner, '__dict__', {}).items(), *(
-            (name, getattr(owner, name)) for name in getattr(owner, '_fields', ()))]
-        for name, value in attributes:
+def sizes(executor):
+    """Return the sizes of what the executor, and all that it consists of, has."""
+    found, seen, todo = Counter(), set(), [executor]
+    while todo:
+        owner = todo.pop()
+        if id(owner) in seen or not type(owner).__module__.startswith('mddag_executor.'):
+            continue
+        seen.add(id(owner))
+        for name in (*getattr(owner, '__dict__', ()), *getattr(owner, '__slots__', ())):
+            value = getattr(owner, name)
+            todo.append(value)
             if hasattr(value, '__len__') and not isinstance(value, str):
-                found[f'{type(owner).__name__}.{name}'] = len(value)
-    return found
-
-
-def used(scheduler):
-    """Return how much of the core's tables is in use; the rest waits to be used again."""
-    state = scheduler.state
-    free = 0
-    for slot in state.free_slot:
-        while slot >= 0:
-            free, slot = free + 1, state.job_next[slot]
-    return {'jobs': len(state.job_next) - free,
-            'groups': len(state.group_owner) - len(scheduler._free_groups)}
-
-
-def tables(executor):
-    engine, pool, at_once = executor._engine, executor._pool, executor._at_once
-    found = used(engine.scheduler) | sizes(
-        executor, engine, engine.jobs, engine.verdicts, executor._registry, executor._upkeep,
-        executor._wait_sets, pool, pool.timers)
-    for name, things in (('pool', [pool.loop]), ('at_once', [at_once.loop, at_once.timers])):
-        found |= {f'{name}.{key}': size for key, size in sizes(*things).items()}
-    return found | {
+                found[f'{type(owner).__name__}.{name}'] += len(value)
+    return found + Counter({
         'deliveries': sum(map(len, publishing._deliveries.values())),
-        'events': len(waitables._known), 'descriptors': len(os.listdir('/proc/self/fd'))}
+        'events': len(waitables._known), 'descriptors': len(os.listdir('/proc/self/fd'))})
 
 
 def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context):
@@ -216,14 +200,14 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
     with Spinning(executor) as spinning:
         cycle(SETTLED)
         assert wait_for(nothing_left)
-        before = tables(executor)
+        before = sizes(executor)
         assert len(before) > 30
         cycle(CYCLES)
         assert wait_for(nothing_left)
 
         def grown():
-            return {name: (before.get(name), size) for name, size in tables(executor).items()
-                    if size - before.get(name, 0) >= CYCLES // 2}
+            return {name: (before[name], size) for name, size in sizes(executor).items()
+                    if size - before[name] >= CYCLES // 2}
         assert wait_for(lambda: not grown()), grown()
 
         def left():
