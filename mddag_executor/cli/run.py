@@ -147,11 +147,11 @@ def part(args: argparse.Namespace) -> int:
         from mddag_executor.hosting.loading import ros_arguments
         with initialised(args.ros_args):
             names = nodes_of(args.node, ros_arguments(args.ros_args))
-        the_part.leave(names)
+        the_part.write_result(names)
         sys.stdout.flush()
         os._exit(0)  # without the ends of programs that were only probed
     result, error = run_here(args, task_set)
-    the_part.leave(result)
+    the_part.write_result(result)
     if args.synthetic is not None and error is None:
         sys.stdout.flush()
         sys.stderr.flush()

@@ -51,12 +51,12 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     """Run nodes in several processes until the run ends, and print what came of the deadlines."""
     from mddag_executor.hosting.measure import ExecutionPlan
     from mddag_executor.hosting.processes import (
-        left,
+        combine_results,
         Part,
         ProcessError,
+        read_result,
         Run,
         Supervisor,
-        together,
     )
     plan = None
     if args.synthetic is not None:
@@ -83,7 +83,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         out = sys.stdout if common.wants_tables(args) else sys.stderr
 
         def ended(run: Run) -> None:
-            Part.ended(folder, run.name)
+            Part.note_end(folder, run.name)
             if run.died:
                 warn(f'process {run.name} {run.how}: {run.said or "it said nothing"}')
 
@@ -98,13 +98,13 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
                 if trace is not None and Path(trace).exists() and os.stat(trace).st_mtime > began:
                     remove_recording(trace)
             raise
-        parts = [left(folder, run.process.pid) for run in supervisor.runs]
+        parts = [read_result(folder, run.process.pid) for run in supervisor.runs]
     results = {run.name: each for run, each in zip(supervisor.runs, parts) if each is not None}
     result = {
         'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
         'policy': args.policy, 'on_late': args.on_late,
         'workers': defaults.workers(args.workers, task_set),
-        **together(task_set, results), 'trace': None,
+        **combine_results(task_set, results), 'trace': None,
         'processes': [{
             'name': run.name, 'nodes': next(
                 p.nodes for p in task_set.processes if p.name == run.name),
@@ -192,7 +192,7 @@ def _probe(
     args: argparse.Namespace, folder: str, specs: Sequence[str]
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
-    from mddag_executor.hosting.processes import left, ProcessError
+    from mddag_executor.hosting.processes import ProcessError, read_result
     # These nodes must not be discovered.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(
@@ -205,7 +205,7 @@ def _probe(
             said = 'it has not made its nodes'
         finally:
             process.kill()
-    names = left(folder, process.pid)
+    names = read_result(folder, process.pid)
     if names is None:
         lines = [line for line in said.splitlines() if line.strip()]
         error = next((line for line in reversed(lines) if line.startswith('error: ')), None)

@@ -183,7 +183,7 @@ def measure(ledger: Ledger, plan: ExecutionPlan) -> dict[str, Any]:
     due = sums['sink_jobs_due']
     return {
         'mode': plan.mode, 'seed': plan.seed, 'workers': plan.workers,
-        'utilisation': plan.utilisation, 'utilisation_taken': _taken(ledger, plan),
+        'utilisation': plan.utilisation, 'utilisation_taken': _measured_utilisation(ledger, plan),
         'window_ns': end.at_ns - start.at_ns, 'warm_up_ns': round(WARM_UP_S * 1e9), **sums,
         'on_time_ratio': sums['on_time'] / due if due else None,
         **_throughput(ledger, plan, start, end),
@@ -244,7 +244,7 @@ def _throughput(
         'cpu_us_per_callback': cpu_us / callbacks if callbacks else None}
 
 
-def _taken(ledger: Ledger, plan: ExecutionPlan) -> float:
+def _measured_utilisation(ledger: Ledger, plan: ExecutionPlan) -> float:
     """
     Return the normalised utilisation from the measured mean times of the bodies.
 

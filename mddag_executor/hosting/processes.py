@@ -55,7 +55,7 @@ from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
 
 END_TIMEOUT_S = 20.0
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _OWN_GROUP: Any = {'process_group': 0} if sys.version_info >= (3, 11) else {}
 _BAD_INPUT = 2
 LEAD_NS = 100_000_000
@@ -154,7 +154,7 @@ class Supervisor:
             for name in names:
                 self._start(name)
             while any(run.status is None for run in self.runs):
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
                 now = time.monotonic()
                 for run in self.runs:
                     if run.status is None and run.process.poll() is not None:
@@ -261,7 +261,7 @@ class Part:
         """Return this process's part from the folder of its run."""
         return cls(Path(folder), **json.loads(Path(folder, 'run.json').read_text()))
 
-    def leave(self, result: Any) -> None:
+    def write_result(self, result: Any) -> None:
         """Store the result of this process in the folder."""
         _write(self.folder / f'{os.getpid()}.json', json.dumps(result, default=list))
 
@@ -271,7 +271,7 @@ class Part:
         return any(Path(folder).glob('*.ready'))
 
     @staticmethod
-    def ended(folder: str, name: str) -> None:
+    def note_end(folder: str, name: str) -> None:
         """Note in the folder that a process has ended."""
         Path(folder, f'{name}.ended').touch()
 
@@ -288,17 +288,17 @@ class Part:
             discovered each other; ``patience_s``: how long to wait for progress.
         :raises mddag_executor.hosting.session.SessionError: when discovery fails.
         """
-        self._come_to('made', name, names, session)
+        self._reach('made', name, names, session)
         session.wait_until_matched(
             lambda: [] if self._is_left_alone() else unmatched(), patience_s)
-        at = self._come_to('ready', name, names, session) + LEAD_NS
+        at = self._reach('ready', name, names, session) + LEAD_NS
         session.wait(max(0, at - time.monotonic_ns()) / 1e9)
         return at
 
     def _is_left_alone(self) -> bool:
         return any(self.folder.glob('*.ended'))
 
-    def _come_to(self, step: str, name: str, names: Sequence[str], session: Session) -> int:
+    def _reach(self, step: str, name: str, names: Sequence[str], session: Session) -> int:
         """Wait until all processes have reached a step; return when the last one did."""
         _write(self.folder / f'{name}.{step}', str(time.monotonic_ns()))
         paths = [self.folder / f'{each}.{step}' for each in names]
@@ -315,13 +315,13 @@ def _write(path: Path, text: str) -> None:
     part.replace(path)
 
 
-def left(folder: str, pid: int) -> Any:
+def read_result(folder: str, pid: int) -> Any:
     """Return the result of a process, None if it has none."""
     path = Path(folder, f'{pid}.json')
     return json.loads(path.read_text()) if path.exists() else None
 
 
-def together(task_set: TaskSet, results: Results) -> dict[str, Any]:
+def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
     """Return the result of a run, combined from those of its processes."""
     parts = list(results.values())
     callbacks: dict[str, dict[str, Any]] = {}
