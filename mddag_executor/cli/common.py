@@ -230,21 +230,6 @@ def output_folder(path: str, names: Collection[str]) -> Iterator[Path]:
         raise
 
 
-@contextmanager
-def output_trace(path: str) -> Iterator[str]:
-    """Give a file that becomes `path` when the block ends well; errors speak of `path`."""
-    from mddag_executor.trace import TraceError
-    from mddag_executor.trace.trace_file import KEPT
-    with output_file(path) as file:
-        try:
-            yield file.name
-        except TraceError as error:
-            if error.file != file.name:
-                raise
-            # the file is taken away
-            raise TraceError(path, error.problem, error.remedy.removeprefix(KEPT)) from None
-
-
 def write_text(path: str, text: str) -> None:
     """Write a text file as a whole, or to standard output for `-`."""
     with output_file(path) as file:

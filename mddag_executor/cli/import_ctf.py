@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 
-from mddag_executor.cli import common, options
+from mddag_executor.cli import options
 from mddag_executor.cli.text import printable, Progress, say, warn
 from mddag_executor.text import counted
 
@@ -30,9 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     from mddag_executor.trace import import_ctf
-    with common.output_trace(args.output) as path, Progress('importing') as line:
+    with Progress('importing') as line:
         imported = import_ctf(
-            args.session, path, progress=lambda events: line.update(events, 'events'))
+            args.session, args.output, overwrite=args.overwrite,
+            progress=lambda events: line.update(events, 'events'))
     warn(*imported.warnings)
     say(f'{counted(imported.events, "event")} of {counted(imported.kinds, "kind")} from '
           f'{counted(len(imported.processes), "process", "processes")}: {printable(args.output)}')

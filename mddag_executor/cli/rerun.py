@@ -99,6 +99,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun import compare, programs
     from mddag_executor.rerun.inputs import open_input
     from mddag_executor.rerun.run import Rerun
+    from mddag_executor.trace.trace_file import whole_trace
     task_set = common.load_graph(args.graph)
     path, name = common.input_path(args.recording)
     with ExitStack() as files:
@@ -108,7 +109,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
             output = files.enter_context(common.output_file(args.output))
         trace = None
         if args.trace is not None:
-            trace = files.enter_context(common.output_trace(args.trace))
+            trace = files.enter_context(whole_trace(args.trace, True))
         run = Rerun(
             messages, times, task_set, workers=args.workers, cpus=args.cpus, policy=args.policy,
             seed=args.seed, all_clocks=args.all_clocks, ros_args=args.ros_args, output=output,

@@ -56,7 +56,8 @@ def main(args: argparse.Namespace) -> int:
             log=args.trace is not None or args.report is not None, progress=line.update)
     if args.trace is not None:
         from mddag_executor.replay.run_writer import write_trace
-        with common.output_trace(args.trace) as path:
+        from mddag_executor.trace.trace_file import whole_trace
+        with whole_trace(args.trace, True) as path:
             write_trace(path, task_set, load, run)
     if args.report is not None:
         from mddag_executor.report.html import of_run

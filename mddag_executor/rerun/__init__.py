@@ -27,6 +27,7 @@ from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.inputs import MessageBag, open_input
 from mddag_executor.rerun.outputs import Output
 from mddag_executor.rerun.run import PATIENCE_S, Rerun, Result
+from mddag_executor.trace.trace_file import whole_trace
 from msg_graph import load, TaskSet
 
 __all__ = [
@@ -84,11 +85,13 @@ def rerun(
     messages, taken = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     with ExitStack() as files:
-        parts = {name: files.enter_context(whole_file(path)) for name, path in written}
+        bag = None if output is None else files.enter_context(whole_file(os.fspath(output)))
+        part = None if trace is None else files.enter_context(
+            whole_trace(os.fspath(trace), overwrite))
         run = Rerun(
             messages, taken, task_set, workers=workers, cpus=cpus, policy=policy, seed=seed,
             all_clocks=all_clocks, patience_s=patience_s, ros_args=ros_args,
-            output=parts.get('output'), trace=parts['trace'].name if 'trace' in parts else None)
+            output=bag, trace=part)
         return run.run(lambda: programs(nodes, ros_args))
 
 

@@ -41,14 +41,13 @@ import subprocess
 import sys
 from typing import Any, IO
 
-from mddag_executor.output_rules import holds_data
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.ctf_helper import PATIENCE_S
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE
-from mddag_executor.trace.trace_file import TraceFile
+from mddag_executor.trace.trace_file import TraceFile, whole_trace
 
 INSTALL = 'apt install python3-bt2'
 _HELPER = Path(__file__).with_name('ctf_helper.py')
@@ -83,7 +82,7 @@ def import_ctf(
 
     :param session: the folder of the session, searched recursively for traces. Several sessions
         are one run that was recorded on several computers.
-    :param output: the trace; removed after an exception
+    :param output: the trace; after an exception what was there before is there
     :param progress: called regularly with the number of events
     :param overwrite: whether an existing file may be replaced
     :raises TraceError: if the session or the file cannot be used, or babeltrace2 is missing
@@ -94,24 +93,19 @@ def import_ctf(
     name = ', '.join(paths)
     if len(set(found)) < len(found):
         raise TraceError(name, 'a session is named twice', 'name each once')
-    file = TraceFile(output, overwrite=overwrite)
-    try:
-        with file:
-            importer = _Importer(name, file)
-            for path in paths:
-                importer.begin()
-                for row in _rows(path):
-                    importer.take(row)
-                    events = importer.result.events
-                    if progress is not None and row[0] == 'event' and events % 5000 == 0:
-                        progress(events)
-            if importer.result.events == 0:
-                raise TraceError(name, 'no event is recorded in it', _RECORD)
-            importer.finish()
-    except BaseException:
-        if holds_data(file.path):   # no pipe
-            os.unlink(file.path)
-        raise
+    with whole_trace(os.fspath(output), overwrite) as part, TraceFile(
+            part, overwrite=True) as file:
+        importer = _Importer(name, file)
+        for path in paths:
+            importer.begin()
+            for row in _rows(path):
+                importer.take(row)
+                events = importer.result.events
+                if progress is not None and row[0] == 'event' and events % 5000 == 0:
+                    progress(events)
+        if importer.result.events == 0:
+            raise TraceError(name, 'no event is recorded in it', _RECORD)
+        importer.finish()
     return importer.result
 
 

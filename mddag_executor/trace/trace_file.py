@@ -20,7 +20,8 @@ All methods must be called by one thread; `TraceWriter` is for many threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 import functools
 import os
 import struct
@@ -41,7 +42,13 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mddag_executor.output_rules import create_recording, EXISTS, REMEDY
+from mddag_executor.output_rules import (
+    create_recording,
+    EXISTS,
+    holds_data,
+    REMEDY,
+    whole_file,
+)
 from mddag_executor.trace import cdr, records
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import Group, GROUPS
@@ -113,6 +120,24 @@ def _schema_name(event: EventType, taken: Collection[str], number: int = 1) -> s
         number += 1
         found = f'{stem}V{number}'
     return found
+
+
+@contextmanager
+def whole_trace(path: str, overwrite: bool = False) -> Iterator[str]:
+    """
+    Give a file that becomes ``path`` when the block ends well; errors name ``path``.
+
+    :raises TraceError: if the file must not be replaced.
+    """
+    if not overwrite and holds_data(path):
+        raise TraceError(path, EXISTS, REMEDY)
+    with whole_file(path) as file:
+        try:
+            yield file.name
+        except TraceError as error:
+            if error.file != file.name:
+                raise
+            raise TraceError(path, error.problem, error.remedy.removeprefix(KEPT)) from None
 
 
 class TraceFile:
