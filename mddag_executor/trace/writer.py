@@ -24,10 +24,8 @@ import logging
 import os
 import threading
 import time
-from types import TracebackType
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import events_of
 from mddag_executor.trace.trace_file import TraceFile
@@ -42,25 +40,22 @@ _NAP_S = 50e-6          # long enough for a waiting thread to get the GIL
 
 class TraceWriter:
     """
-    Records events from many threads into a trace file; usable as a context manager.
+    Records events from many threads into a trace file.
 
     The file is readable at any time up to its last whole chunk, and complete after `close()`.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, clock_offset: int | None = None,
+    def __init__(self, path: str | os.PathLike[str], *, clock_offset: int = 0,
                  flush_interval_s: float = 0.25, capacity: int = 1 << 17,
                  overwrite: bool = False) -> None:
         """
         Open the file and start the writer thread.
 
-        :param clock_offset: ns between the trace's clock and `time.monotonic_ns()`; default: the
-            trace's clock counts from the epoch
+        :param clock_offset: ns between the trace's clock and `time.monotonic_ns()`
         :param flush_interval_s: interval at which events are written to the operating system
         :param capacity: maximum number of events that wait for the writer thread
         :param overwrite: whether an existing file may be replaced
         """
-        if clock_offset is None:
-            clock_offset = epoch_offset_ns()
         #: Offset from `time.monotonic_ns()` to the trace's clock.
         self.clock_offset = clock_offset
         #: Why recording ended early; None: no error.
@@ -193,14 +188,3 @@ class TraceWriter:
             self._lost += taken - self._file.rejected - self._file.written
         self.error = error
         _LOGGER.error('%s', error)
-
-    def __enter__(self) -> TraceWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 traceback: TracebackType | None) -> None:
-        """Close the writer; an exception of the block has priority over one of `close()`."""
-        if kind is None:
-            self.close()
-        else:
-            self._end()

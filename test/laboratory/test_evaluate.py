@@ -161,12 +161,21 @@ def test_several_task_sets(small):
     assert (outcome.utilisation[:20] == alone.utilisation).all()
     # With twice the workers the same runs would have half the utilisation: these are others.
     assert (outcome.utilisation[20:40] * 2 != outcome.utilisation[:20]).any()
-    again = evaluate(experiments, 30)  # more runs of each: the first ones stay
-    assert (again.utilisation.reshape(3, 30)[:, :20] == outcome.utilisation.reshape(3, 20)).all()
     assert outcome.bins == WIDE_BINS and sum(outcome.bound().runs) == 60
-    graphs = outcome.result()['graphs']
+    whole = outcome.result()
+    graphs = whole['graphs']
     assert [each['graph'] for each in graphs] == ['small.yaml', 'small.yaml', 'other.yaml']
     assert sum(each['accepted']['rad'] for each in graphs) == outcome.accepted[0].sum()
+    # ranges of runs make up the whole
+    parts = [evaluate(experiments, runs, first_run=first).result()
+             for first, runs in ((0, 11), (11, 9))]
+    assert [part['first_run'] for part in parts] == [0, 11]
+    for figures in (
+            lambda result: result['counts'], lambda result: result['policies']['fifo']['accepted'],
+            lambda result: [graph['accepted']['fifo'] for graph in result['graphs']]):
+        assert [sum(each) for each in zip(*map(figures, parts))] == figures(whole)
+    with pytest.raises(UsageError, match='first run: 1099511627776 is out of range'):
+        evaluate(experiments, 1, first_run=2 ** 40)
 
 
 # Python 3.11's pool ends its thread with an error if a chunk was cancelled before.
@@ -185,26 +194,6 @@ def test_interrupted_by_a_signal_to_all_processes(small):
     last = evaluate(experiment, 1, first_run=number, compiled=False)
     assert (outcome.accepted[:, number] == last.accepted[:, 0]).all()
     assert sum(outcome.result()['counts']) == outcome.runs
-
-
-def test_ranges_of_runs_make_up_the_whole(small):
-    experiments = [Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=s)
-                   for s in (1, 2)]
-    whole = evaluate(experiments, 30).result()
-    parts = [evaluate(experiments, runs, first_run=first).result()
-             for first, runs in ((0, 11), (11, 19))]
-    assert [part['first_run'] for part in parts] == [0, 11]
-
-    def add_up(figures):
-        return [sum(each) for each in zip(*map(figures, parts))] == figures(whole)
-
-    assert add_up(lambda result: result['counts'])
-    for name in ('rad', 'fifo'):
-        assert add_up(lambda result: result['policies'][name]['accepted'])  # noqa: B023
-        assert add_up(lambda result: [
-            graph['accepted'][name] for graph in result['graphs']])  # noqa: B023
-    with pytest.raises(UsageError, match='first run: 1099511627776 is out of range'):
-        evaluate(experiments, 1, first_run=2 ** 40)
 
 
 distributed = pytest.importorskip('distributed', reason='the extra dask is not installed')

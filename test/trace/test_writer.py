@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live writer: many threads, kills, full buffers, full disks."""
 
+from contextlib import closing
 import errno
 import os
 import signal
@@ -32,7 +33,7 @@ def test_a_live_trace_is_readable(tmp_path):
     path = tmp_path / 'a.mcap'
     recorded = [*mixture(1000), ('ros2:callback_end', 7, 8, 9)]
     expected = read_back(recorded, os.getpid())
-    with TraceWriter(path, flush_interval_s=FAST) as writer:
+    with closing(TraceWriter(path, flush_interval_s=FAST)) as writer:
         for entry in recorded[:-1]:
             writer.record(*entry)
         writer.record('callback_end', 7, 8, 9)      # by its short name
@@ -81,7 +82,7 @@ def test_what_cannot_be_written_costs_nothing_else(tmp_path, caplog):
         (EXECUTION, START, 1), (PUBLICATION, START, 1, 'text', 2), (PUBLICATION,),
         (EXECUTION, START, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0, True, 0, 0, False)]
     lost = len(bad) + 1 + 2 * 3 + 2 * 1  # two groups of four events, and two of two
-    with TraceWriter(path, flush_interval_s=FAST) as writer:
+    with closing(TraceWriter(path, flush_interval_s=FAST)) as writer:
         for number, entry in enumerate(bad):
             writer.record('callback_end', START + number, 1, number)
             writer.record(*entry)
@@ -117,7 +118,7 @@ def test_a_full_disk_at_the_start():
 KILLED = """
 import sys, time
 from mddag_executor.trace import TraceWriter
-writer = TraceWriter(sys.argv[1], clock_offset=0)
+writer = TraceWriter(sys.argv[1])
 number = 0
 while True:
     writer.record('callback_end', writer.now(), 1, number)
