@@ -207,8 +207,8 @@ class VirtualTime:
     def _thread_start(self, original: Callable[[Any], None]) -> Callable[[Any], None]:
         def start(thread: threading.Thread) -> None:
             run_threads = self._loop.run_threads
-            if not self._loop.in_run or run_threads.over:
-                original(thread)
+            if not self._loop.in_run or run_threads.over or thread.ident is not None:
+                original(thread)  # raises if it has started before
                 return
             run_thread = self._threads[thread] = run_threads.make(f'thread {thread.name}')
             thread.daemon = True  # one that does not end keeps no process from ending

@@ -140,7 +140,10 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
                     return
 
         pool = ThreadPoolExecutor(2)
-        threading.Thread(target=work, daemon=True).start()
+        thread = threading.Thread(target=work, daemon=True)
+        thread.start()
+        with pytest.raises(RuntimeError):
+            thread.start()
 
     def take(node, number):
         node.numbers.put(number)
