@@ -24,7 +24,6 @@ Each run is a process of its own.  ``--scale`` makes all times longer, for busy 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 import itertools
 from pathlib import Path
 import signal
@@ -179,9 +178,14 @@ def measure(misses: int, scale: float, wanted: list[str]) -> None:
         print(f'{cause:<15}{total:>8}{right / max(1, total):>11.1%}   {instead}', flush=True)
 
 
-def main(parse: Callable[[], argparse.Namespace]) -> None:
+def main() -> None:
     """Measure, or record one run."""
-    args = parse()
+    parser = argparse.ArgumentParser(description='What explain reports of live runs.')
+    parser.add_argument('cause', nargs='*', choices=[*PERIODS, []], help='default: all of them')
+    parser.add_argument('--misses', type=int, default=100, help='about so many of each cause')
+    parser.add_argument('--scale', type=float, default=1.0, help='of all times')
+    parser.add_argument('--record', nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args()
     if args.record is None:
         measure(args.misses, args.scale, args.cause)
         return
@@ -195,14 +199,5 @@ def main(parse: Callable[[], argparse.Namespace]) -> None:
     rclpy.shutdown()
 
 
-def _parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description='What explain reports of live runs.')
-    parser.add_argument('cause', nargs='*', choices=[*PERIODS, []], help='default: all of them')
-    parser.add_argument('--misses', type=int, default=100, help='about so many of each cause')
-    parser.add_argument('--scale', type=float, default=1.0, help='of all times')
-    parser.add_argument('--record', nargs=3, help=argparse.SUPPRESS)
-    return parser.parse_args()
-
-
 if __name__ == '__main__':
-    main(_parse)
+    main()

@@ -54,13 +54,10 @@ def time_runs(
     :param repeat: number of repetitions, each with its own draws; medians are returned.
     :return: for JSON; ``ms`` is wall-clock time for each run and policy.
     """
-    evaluate(experiment, jobs, jobs=jobs,
-                           compiled=core == 'compiled')  # compiled or loaded, memory in place
-    taken = []
-    for number in range(repeat):
-        outcome = evaluate(replace(experiment, seed=number), runs, jobs=jobs,
-                           compiled=core == 'compiled')
-        taken.append(outcome.elapsed_s)
+    compiled = core == 'compiled'
+    evaluate(experiment, jobs, jobs=jobs, compiled=compiled)  # compile or load, touch memory
+    taken = [evaluate(replace(experiment, seed=number), runs, jobs=jobs, compiled=compiled)
+             .elapsed_s for number in range(repeat)]
     each = median(taken) / runs / len(experiment.policies)
     return {
         'core': core, 'jobs': jobs, 'runs': runs, 'policies': list(experiment.policies),

@@ -28,6 +28,7 @@ the machine stopped: another process, which only sleeps, was woken more than ``S
 
 import argparse
 from collections import deque
+from contextlib import suppress
 import ctypes
 from dataclasses import asdict
 import gc
@@ -37,6 +38,7 @@ from pathlib import Path
 import random
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 
@@ -74,20 +76,19 @@ while True:
 
 
 class StallWatch:
-    """Notes when a process that only sleeps was woken late, ns since the epoch."""
+    """Notes when a process that only sleeps was woken late."""
 
     def __init__(self):
-        self.stalls = []
-        self._process = subprocess.Popen(
-            [sys.executable, '-c', _SLEEPER], stdout=subprocess.PIPE, text=True)
-        self._thread = threading.Thread(
-            target=lambda: self.stalls.extend(map(int, self._process.stdout)), daemon=True)
-        self._thread.start()
+        self._file = tempfile.TemporaryFile('w+')
+        self._process = subprocess.Popen([sys.executable, '-c', _SLEEPER], stdout=self._file)
 
     def stop(self):
+        """End it; return when that was, ns since the epoch."""
         self._process.kill()
         self._process.wait()
-        self._thread.join()
+        with self._file as file:
+            file.seek(0)
+            return [int(line) for line in file]
 
 
 class SoakFault(Exception):
@@ -101,7 +102,6 @@ class SoakNodes:
         self.workload = SyntheticWorkload(task_set, plan, current_job=current_job)
         self.started = 0  # callbacks
         self.raise_next = False  # lets the next one raise
-        self.cut_off = 0  # those whose node was destroyed while they ran: they could not publish
         self._lock = threading.Lock()
         self.nodes = {node.get_fully_qualified_name(): node for node in self.workload.nodes}
         for node in self.workload.nodes:
@@ -133,10 +133,8 @@ class SoakNodes:
                 raises, self.raise_next = self.raise_next, False
             if raises:
                 raise SoakFault('on purpose')
-            try:
+            with suppress(InvalidHandle):  # the node was destroyed meanwhile
                 callback(*message)
-            except InvalidHandle:
-                self.cut_off += 1
 
         return timer if callback.__code__.co_argcount == 0 else subscription
 
@@ -276,7 +274,7 @@ class Soak:
         """
         for fault in FAULTS:
             if fault != 'burst':
-                self._inject(fault, 0.1)
+                getattr(self, f'_{fault}')(0.1)
         time.sleep(RECOVERY_S)  # a new timer is known by its period: that is not altered yet
         self._burst(FAULT_S, list(self.nodes.workload.timers.values()))
         time.sleep(RECOVERY_S)
@@ -284,7 +282,7 @@ class Soak:
     def _one_fault(self):
         fault = self._random.choice(FAULTS)
         self.counts[fault] += 1
-        self._inject(fault, FAULT_S)
+        getattr(self, f'_{fault}')(FAULT_S)
         time.sleep(RECOVERY_S)
         end = time.monotonic() + BACKLOG_S
         while self._has_backlog() and time.monotonic() < end:
@@ -299,9 +297,6 @@ class Soak:
     def _has_backlog(self):
         callbacks = self.executor.statistics()['callbacks'].values()
         return any(counts['waiting'] > 1 for counts in callbacks)
-
-    def _inject(self, fault, seconds):
-        getattr(self, f'_{fault}')(seconds)
 
     def _destroy(self, seconds):
         name = self._random.choice(list(self.nodes.nodes))
@@ -352,10 +347,10 @@ class Soak:
         n_open = list(self.executor._engine.scheduler.state.n_open)
         self._simulated.stop()
         self.nodes.workload.destroy()
-        self._stalls.stop()
+        stalls = self._stalls.stop()
         # what is released last in a window runs on beyond it, and may wait for what was before
         judged = [(start, stop) for start, stop, _ in self._clean if not any(
-            start - 500_000_000 <= stall < stop + 200_000_000 for stall in self._stalls.stalls)]
+            start - 500_000_000 <= stall < stop + 200_000_000 for stall in stalls)]
         self._sort_out()
         clean_misses = [
             (fault, miss) for fault, miss in self._clean_missed
@@ -365,9 +360,9 @@ class Soak:
             'jobs': sum(d['jobs'] for d in statistics['dags'].values()),
             **{key: sum(counts[key] for counts in statistics['callbacks'].values())
                for key in ('ready', 'ran', 'dropped', 'skipped', 'unattributed')},
-            'cut_off': self.nodes.cut_off, 'clean_windows': len(self._clean),
+            'clean_windows': len(self._clean),
             'disturbed_windows': len(self._clean) - len(judged),
-            'stalls': len(self._stalls.stalls), 'clean_misses': len(clean_misses),
+            'stalls': len(stalls), 'clean_misses': len(clean_misses),
             'clean_missed': [
                 {'after': fault, **asdict(miss)} for fault, miss in clean_misses[:MOST_LISTED]],
             'unjudged_sinks': self._unjudged, 'simulated_ticks': ticks}
