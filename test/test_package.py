@@ -3,6 +3,7 @@
 """What `import mddag_executor` gives."""
 
 import mddag_executor
+from mddag_executor.text import listed
 import pytest
 
 
@@ -16,3 +17,7 @@ def test_public_names_are_those_of_the_live_executor():
     assert {'MultiDeadlineExecutor', 'DeadlineMiss'} <= set(names) & set(dir(mddag_executor))
     with pytest.raises(AttributeError, match="no attribute 'Nonsense'"):
         mddag_executor.Nonsense  # noqa: B018
+
+
+def test_a_long_list_is_shortened():
+    assert (listed('abcde'), listed('abcdefg')) == ('a, b, c, d, e', 'a, b, c, d, e, … (2 more)')

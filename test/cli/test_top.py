@@ -84,10 +84,7 @@ def test_names_and_verdicts_are_whole_in_every_terminal(width, processes):
             row = next(line for line in lines if line.startswith((
                 f'{status.name} ', f'{status.process}  {status.name} ')))
             assert status.level in row
-    title = next(line for line in lines if 'DAG' in line)
-    assert 'missed' in title or len(processes) > 1 and width < 80
-    assert ('process' in title) == (len(processes) > 1)
-    assert ('least margin' in title) == (width >= (120 if len(processes) == 1 else 150))
+    assert ('process' in next(line for line in lines if 'DAG' in line)) == (len(processes) > 1)
     assert '…' not in ''.join(lines)
     if processes == ('robot/4711',) and width in (80, 200):
         golden.compare(f'top_{width}', tables(statuses, width))
