@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Execution times, durations, longest paths and load; look-ups by name."""
 
-from itertools import permutations
-
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from msg_graph import DurationError, ExecutionTime, format_duration, loads, model, parse_duration
 from msg_graph.duration import DAY, exact_duration
 import pytest
+import yaml
 
+from .brute import all_violations, as_yaml
 from .helpers import graph
+from .test_against_brute_force import declarations
 
 
 def test_draws_between_the_quantiles():
@@ -47,35 +48,17 @@ def test_unknown_where_an_execution_time_is_missing():
     assert model.load_of(dag) is None
 
 
-@st.composite
-def weighted(draw):
-    """Draw a DAG of up to seven vertices, in a random file order, with weights."""
-    count = draw(st.integers(1, 7))
-    order = draw(st.permutations(range(count)))
-    before = {i: draw(st.sets(st.integers(0, i - 1), min_size=1)) for i in range(1, count)}
-    lines = ['mddag: 1', 'nodes:', '- node: /n', '  callbacks:']
-    for i in order:
-        start = 'timer: 10ms'
-        if i:
-            topics = [f'/t{b}' for b in sorted(before[i])]
-            start = (f'sync: [{", ".join(topics)}]' if len(topics) > 1
-                     else f'subscription: {topics[0]}')
-        sink = not any(i in each for each in before.values())
-        lines.append(
-            f'  - {{name: c{i}, {start}, publishes: [/t{i}]{", deadline: 1ms" * sink}}}')
-    weights = draw(st.lists(st.integers(0, 9), min_size=count, max_size=count))
-    return loads('\n'.join(lines)).dags[0], weights
+@given(declarations(), st.data())
+def test_path_lengths_are_those_of_all_paths(specs, data):
+    assume(not all_violations(specs))
+    for dag in loads(yaml.safe_dump(as_yaml(specs))).dags:
+        count = len(dag.vertices)
+        weights = data.draw(st.lists(st.integers(0, 9), min_size=count, max_size=count))
 
+        def longest(i, dag=dag, weights=weights):
+            return weights[i] + max(map(longest, dag.vertices[i].successors), default=0)
 
-@given(weighted())
-def test_path_lengths_are_those_of_all_paths(case):
-    dag, weights = case
-    best = 0
-    for length in range(len(dag.vertices)):
-        for rest in permutations(range(len(dag.vertices)), length + 1):
-            if all(step in dag.edges for step in zip(rest, rest[1:])):
-                best = max(best, sum(weights[i] for i in rest))
-    assert max(model.path_lengths(dag, weights)) == best
+        assert max(model.path_lengths(dag, weights)) == longest(dag.source)
 
 
 @pytest.mark.parametrize(('text', 'ns'), [
