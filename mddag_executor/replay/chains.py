@@ -118,7 +118,7 @@ class Chains:
 
     def __init__(self, judged: Judged, executions: Table, waited: Ints) -> None:
         if not len(executions):     # row -1 must exist
-            executions, waited = rows(EXECUTIONS, 1), np.zeros(1, dtype=np.int64)
+            executions, waited = rows(EXECUTIONS, 1, vertex=-1), np.zeros(1, dtype=np.int64)
         self._judged, self._executions, self.waited = judged, executions, waited
         self._first = judged.tables.first_vertex
         #: By DAG, vertex and leg the vertex that publishes its message.
@@ -171,7 +171,7 @@ class Chains:
             found[name] = np.where(running, NEVER, table[name])
         return found
 
-    def _chains(self, dag: int) -> _Dag:
+    def _of_dag(self, dag: int) -> _Dag:
         """Find the chains of a DAG, and the breakdown of its sinks."""
         if dag in self._dags:
             return self._dags[dag]
@@ -198,7 +198,7 @@ class Chains:
 
     def _follow(self, dag: int, which: Ints, vertex: Ints, job: Ints) -> Iterator[Table]:
         """Yield the links of chains from last to first; ``which``: numbers of the chains."""
-        of = self._chains(dag)
+        of = self._of_dag(dag)
         while len(which):
             links = self._links(dag, vertex, of.row[vertex, job])
             links['of'] = which
@@ -220,7 +220,7 @@ class Chains:
         legs = self._legs[dag]
         width = max(1, *map(len, legs))
         before = np.array([each + [-1] * (width - len(each)) for each in legs])
-        row = self._chains(dag).row[:, missed['row']].T
+        row = self._of_dag(dag).row[:, missed['row']].T
         row[self._executions['began'][row] > missed['until'][:, None]] = -1
         end = np.where(self._is_other[row], NEVER, self._executions['end'][row])
         every, at = np.arange(len(missed)), missed['sink'] - self._first[dag]
@@ -246,7 +246,7 @@ class Chains:
     def breakdown(self) -> dict[int, dict[str, Any]]:
         """Return by sink the breakdown of its completed jobs: means, and the worst job."""
         for dag in range(len(self._legs)):
-            self._chains(dag)
+            self._of_dag(dag)
         return self._breakdown
 
     def _add_breakdown(self, dag: int, v: int, chain: _Chain) -> None:

@@ -136,6 +136,14 @@ def test_what_ran_after_the_end_of_a_job_does_not_explain_its_miss(trace):
                for each in jobs)
 
 
+def test_a_miss_of_a_run_in_which_nothing_ran(trace):
+    trace.release(0, 0, 10)
+    trace.add('expire', 40, 0, 0)
+    jobs = replay(trace.end(60)).explanation.result()['jobs']
+    assert [(part['cause'], part['ns']) for each in jobs for part in each['parts']] == [
+        ('lost', 30 * MS)] * 2
+
+
 def test_legs_that_complete_at_once_may_be_in_several_batches(trace, monkeypatch):
     monkeypatch.setattr(reading, '_BATCH_BYTES', 1)
     trace.piece(0, 4, 0, 10, 12)
