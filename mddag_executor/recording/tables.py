@@ -348,14 +348,14 @@ def later_pieces(executions: Table) -> tuple[Ints, Ints]:
 
 
 def sort_by(*columns: Any) -> Ints:
-    """Return the stable order of rows by several columns, the first one first."""
+    """Return the stable order of rows by several columns of integers, the first one first."""
     if len(columns) > 1:
         order: Ints = np.lexsort(columns[::-1])
         return order
     column, = columns
     least = column.min() if len(column) else 0
-    if len(column) and int(column.max()) - int(least) < 2 ** 15:
-        column = (column - least).astype(np.int16)      # numpy sorts these much faster
+    if len(column) and int(column.max()) - int(least) < 2 ** 15:    # 16 bits are sorted faster
+        column = np.subtract(column, least, dtype=np.int64).astype(np.int16)
     order = np.argsort(column, kind='stable')
     return order
 
