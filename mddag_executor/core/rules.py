@@ -316,36 +316,29 @@ def peek(t: Tables, s: State, now: int) -> int:
                     heappush(s.group_heap[group], entry)
                 else:
                     wait_for_poll(t, s, entry)
-                queue = next_queue(t, s, False)
-                continue
-            if (vertex < t.n_vertices and now > s.job_hope[s.x_slot[x]] + s.start_by[vertex]
+            elif (vertex < t.n_vertices and now > s.job_hope[s.x_slot[x]] + s.start_by[vertex]
                     and demote(t, s, x, now)):
                 if group >= 0 and s.group_owner[group] == -1:
                     _release_group(s, group)  # others of the group may go first
-                queue = next_queue(t, s, False)
-                continue
-            if ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
+            elif ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
                     and not may_start(t, s, entry)):
                 _defer(s, queue, s.held_back)
-                queue = next_queue(t, s, False)
-                continue
-            if s.scalars[REFUSES] > 0 and not leaves_room(t, s, x, now):
+            elif s.scalars[REFUSES] > 0 and not leaves_room(t, s, x, now):
                 _defer(s, queue, s.reserved)
-                queue = next_queue(t, s, False)
-                continue
-            if vertex == t.n_vertices:
+            elif vertex == t.n_vertices:
                 return x
-            slot = s.x_slot[x]
-            if s.job_state[slot] == OPEN:
-                if (t.on_late[s.job_dag[slot]] != ABORT
-                        or next_deadline(t, s, slot, -NEVER) >= now):
+            else:
+                slot = s.x_slot[x]
+                if s.job_state[slot] == OPEN:
+                    if (t.on_late[s.job_dag[slot]] != ABORT
+                            or next_deadline(t, s, slot, -NEVER) >= now):
+                        return x
+                    give_up(t, s, slot, ABORTED, now)
+                if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
                     return x
-                give_up(t, s, slot, ABORTED, now)
-            if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
-                return x
-            drop(s, x, now)
+                drop(s, x, now)
+                again = True
             queue = next_queue(t, s, False)
-            again = True
         if not again or len(s.unpolled) == 0:
             return -1
         again = False  # a poll that finds only busy groups is the last
@@ -382,7 +375,7 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     s.worker_x[worker] = x
     s.scalars[N_IDLE] -= 1
     if s.x_holds[x] != 0:
-        s.scalars[N_HOLDING] += s.x_holds[x]
+        s.scalars[N_HOLDING] += 1
     group = s.x_group[x]
     if group >= 0:
         s.group_owner[group] = x
@@ -434,7 +427,7 @@ def lend(s: State, x: int) -> None:
     if worker >= 0:
         s.worker_x[worker] = -1
         s.x_worker[x] = -1
-        s.scalars[N_HOLDING] -= s.x_holds[x]
+        s.scalars[N_HOLDING] -= int(s.x_holds[x] != 0)
         s.scalars[N_IDLE] += 1
 
 
@@ -446,7 +439,7 @@ def progress(s: State, x: int, now: int) -> int:
 def stop_holding(s: State, x: int) -> None:
     """Release the interpreter for an execution that turns out not to hold it (rule 11)."""
     if s.x_worker[x] >= 0:
-        s.scalars[N_HOLDING] -= s.x_holds[x]
+        s.scalars[N_HOLDING] -= int(s.x_holds[x] != 0)
     s.x_holds[x] = 0
 
 
@@ -489,7 +482,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         s.x_worker[x] = -1
         s.scalars[N_IDLE] += 1
         if s.x_holds[x] != 0:
-            s.scalars[N_HOLDING] -= s.x_holds[x]
+            s.scalars[N_HOLDING] -= 1
     s.x_state[x] = DONE
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == x:
