@@ -51,6 +51,7 @@ from mddag_executor.recording.tables import (
     Recording,
     RELEASES,
     rows,
+    rows_by,
     sort_by,
     STOPS,
     Table,
@@ -209,8 +210,9 @@ class _Source:
         found.publications = self._publications(found.executions, completed)
         found.releases, released_at = self._releases(self._pop(_RELEASE))
         found.job_ends, ends_at = self._job_ends()
-        found.misses = self._misses()
-        found.demotions = self._demotions()
+        found.misses = self._at_vertices(
+            _DEADLINE, MISSES, job='job', deadline='deadline', completed='completed')
+        found.demotions = self._at_vertices(_DEMOTE, DEMOTIONS, job='job', time='timestamp')
         stops = self._pop(_STOP)
         found.notices_stops = earliest(stops['end'])
         stops = stops[stops['begin'] < stops['end']]    # the first one is empty: stops are noticed
@@ -246,17 +248,16 @@ class _Source:
 
     def _releases(self, released: Table) -> tuple[Table, Ints]:
         """Return the releases, and their positions in the file."""
-        released = released[sort_by(released['timestamp'], released['place'])]
+        released = pick(released, sort_by(released['timestamp'], released['place']))
         good = (released['dag'] >= 0) & (released['dag'] < len(self._task_set.dags))
         self._left_out(_RELEASE, 'of a DAG that is not declared', ~good)
         again = np.zeros(len(released), dtype=np.bool_)
-        for dag in range(len(self._task_set.dags)):
-            mine = np.flatnonzero(good & (released['dag'] == dag))
+        for mine in rows_by(np.where(good, released['dag'], -1), len(self._task_set.dags)):
             newest = np.maximum.accumulate(np.r_[-1, released['job'][mine]])
             again[mine] = released['job'][mine] <= newest[:-1]
         self._left_out(_RELEASE, 'of a job that is not newer than the last', again)
         good &= ~again
-        released = released[good]
+        released = pick(released, good)
         release, noticed = released['release'], released['timestamp']
         to_come = (release < 0) | (release > noticed)
         self._left_out(_RELEASE, 'of a release that is still to come', to_come)
@@ -285,17 +286,12 @@ class _Source:
             places.append(found['place'][good])
         return np.concatenate(tables), np.concatenate(places)
 
-    def _misses(self) -> Table:
-        found = self._pop(_DEADLINE)
+    def _at_vertices(self, name: str, kind: np.dtype[Any], **fields: str) -> Table:
+        """Return events as rows of a type; ``fields``: by column the field of the events."""
+        found = self._pop(name)
         dag, vertex = self._numbering.of(found['dag'], found['vertex'])
-        return rows(MISSES, len(found), dag=dag, vertex=vertex, job=found['job'],
-                    deadline=found['deadline'], completed=found['completed'])
-
-    def _demotions(self) -> Table:
-        found = self._pop(_DEMOTE)
-        dag, vertex = self._numbering.of(found['dag'], found['vertex'])
-        return rows(DEMOTIONS, len(found), dag=dag, vertex=vertex, job=found['job'],
-                    time=found['timestamp'])
+        return rows(kind, len(found), dag=dag, vertex=vertex, **{
+            column: found[field] for column, field in fields.items()})
 
     def _set_end(self, found: Recording) -> None:
         """Find the end of the run, and process events that are not in tables."""
