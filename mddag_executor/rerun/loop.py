@@ -57,6 +57,7 @@ from mddag_executor.simulate.machine import (
     settle,
     share,
 )
+from rclpy.exceptions import InvalidHandle
 
 DRAIN_NS = 10_000_000_000
 """What has begun may go on this long after the end of the recording, and in a pause of it."""
@@ -301,6 +302,8 @@ class Loop:
                 self.refresh_now()  # its node may just have been destroyed
             if isinstance(error, SystemExit) and error.code in (None, 0):
                 self.stop()
+            elif self.run_threads.over and isinstance(error, InvalidHandle):
+                pass  # Kilted destroys the nodes of a context that ends
             elif self.run_threads.over or entity.removed:  # while it has waited
                 end = 'the run' if self.run_threads.over else 'its node'
                 self.warn(f'{entity.name}: after the end of {end} it raised {describe(error)}')

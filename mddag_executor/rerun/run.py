@@ -246,8 +246,6 @@ class Rerun:
                 sys.argv = arguments
                 if self._recorder is not None:
                     self._recorder.close(loop.now)
-                for node in self._holder.ordered_nodes():   # they would keep the context in use
-                    Node.destroy_node(node)
         for guest in self._host.guests:
             if guest.error is not None and not isinstance(guest.error, _ENDS):
                 loop.warn(
@@ -256,7 +254,10 @@ class Rerun:
         if not self._hosted:
             loop.warn(self._none_hosted())
         self._outputs.finish()
-        return self._result(time.monotonic() - begun)
+        result = self._result(time.monotonic() - begun)
+        for node in self._holder.ordered_nodes():   # they would keep the context in use
+            Node.destroy_node(node)
+        return result
 
     def _passed_ns(self) -> int:
         return self._loop.now - self._loop.start
