@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+import re
 from typing import Any
 
 from mddag_executor.core import NEVER
@@ -85,6 +86,8 @@ _ROWS = {name: np.dtype([(field, 'i8') for field in ('place', 'timestamp', *fiel
 _JOB_ENDS = {_EXPIRE: EXPIRED, _ABORT: ABORTED, _FAIL: FAILED, _OUTDATE: OUTDATED}
 _CORE = (_RELEASE, _DEADLINE, *_JOB_ENDS)
 """Events that the executor's core processed: the run lasts at least until the last of them."""
+
+_VERTEX = re.compile('[0-9]{1,9}')
 
 Progress = Callable[[int], None]
 
@@ -336,7 +339,7 @@ class _Source:
     def _hosted(self, event: Event) -> frozenset[int] | None:
         dag, text = event[4:6]
         words = text.split(',') if text else []
-        found = [self._numbering.one(dag, int(word)) if word.isascii() and word.isdigit() else -1
+        found = [self._numbering.one(dag, int(word)) if _VERTEX.fullmatch(word) else -1
                  for word in words]
         if not 0 <= dag < len(self._task_set.dags) or -1 in found:
             self._strange[f'{_HOSTED} of a vertex that is not declared'] += 1

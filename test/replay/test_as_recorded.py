@@ -274,6 +274,13 @@ def test_a_result_before_the_release_is_said(tmp_path):
     assert (again.work.load.times.tolist(), again.warnings) == ([ns(10)], outcome.warnings)
 
 
+@pytest.mark.parametrize('vertices', ['7', 'x', '9' * 30, '9' * 5000])
+def test_a_process_with_vertices_that_are_not_declared(trace, vertices):
+    trace.add('hosted', 0, 0, vertices)
+    assert replay(trace.end(110)).warnings[0].endswith(
+        '1 event that make no sense, most often (1) mddag:hosted of a vertex that is not declared')
+
+
 def test_a_trace_without_a_usable_declaration(tmp_path):
     path = Written(tmp_path / 'a.mcap', 'nonsense').end(1)
     for name in (None, '<stdin>'):
