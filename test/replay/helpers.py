@@ -148,6 +148,14 @@ class Written:
         self.add('complete', end, address, dag, vertex, job, whole, ns(end), leg, *computed,
                  thread=thread)
 
+    def group(self, kind, *addresses):
+        """Put callbacks (of timers: vertex v of DAG d is 1000 + 100 * d + v) into a group."""
+        self.add('add_callback_group', 0, 1, 900, kind)
+        for address in addresses:
+            self.add('rcl_timer_init', 0, address, 100 * MS)
+            self.add('rclcpp_timer_callback_added', 0, address, address)
+            self.add('callback_group_add_timer', 0, 900, address)
+
     def end(self, at):
         self.add('shutdown', at, ns(at))
         self.file.finish()

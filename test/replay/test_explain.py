@@ -102,11 +102,7 @@ def test_the_right_cause_is_told(cause, tmp_path):
     trace = Written(tmp_path / 'run.mcap', SYNC if special == 'sync' else VICTIM,
                     plan.pop('workers', 2))
     if plan.pop('grouped', False):
-        trace.add('add_callback_group', 0, 1, 900, 'mutually_exclusive')
-        for address in (1001, 1100):        # of /victim:use and /heavy:first
-            trace.add('rcl_timer_init', 0, address, 1)
-            trace.add('rclcpp_timer_callback_added', 0, address, address)
-            trace.add('callback_group_add_timer', 0, 900, address)
+        trace.group('mutually_exclusive', 1001, 1100)       # of /victim:use and /heavy:first
     for job in range(JOBS):
         if special == 'sync':
             record_sync(trace, job, **plan if job % 5 == 4 else {})

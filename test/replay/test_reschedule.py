@@ -78,34 +78,27 @@ nodes:
     assert outcome.tables.group[:2] == [0, -1]
 
 
-TIMER_AND_MESSAGE = """\
+TWO_TIMERS = """\
 mddag: 1
 nodes:
   - node: /n
     callbacks:
       - {name: a, timer: 100ms, deadline: 90ms, dag: a}
-      - {name: b, service: /s, period: 100ms, deadline: 80ms, dag: b}
+      - {name: b, timer: 100ms, deadline: 80ms, dag: b}
 """
 
 
 def test_recorded_callback_groups_are_kept(tmp_path):
     apart, together = [(0, 0, 1, 0), (5, 0, 0, 0)], [(0, 0, 1, 0), (0, 1, 0, 0)]
     for kind, expected in (('reentrant', together), ('mutually_exclusive', apart)):
-        trace = Written(tmp_path / f'{kind}.mcap', TIMER_AND_MESSAGE, 2)
-        for event in (
-                ('add_callback_group', 1, 70, kind), ('rcl_timer_init', 11, 100 * MS),
-                ('rclcpp_timer_callback_added', 11, 1000), ('callback_group_add_timer', 70, 11),
-                ('rcl_subscription_init', 12, 2, 12, '/x', 1),
-                ('rclcpp_subscription_init', 12, 120),
-                ('rclcpp_subscription_callback_added', 120, 1100),
-                ('callback_group_add_subscription', 70, 12)):
-            trace.add(event[0], 0, *event[1:])
+        trace = Written(tmp_path / f'{kind}.mcap', TWO_TIMERS, 2)
+        trace.group(kind, 1000, 1100)
         for dag in (0, 1):
             trace.release(dag, 0, 0)
             trace.run(dag, 0, 0, 0, 5, worker=dag)
         assert starts(reschedule(trace.end(20)).log) == expected
     # a group of another declaration goes before the recorded one
-    declared = TIMER_AND_MESSAGE.replace('dag: a', 'dag: a, group: own').replace('90ms', '91ms')
+    declared = TWO_TIMERS.replace('dag: a', 'dag: a, group: own').replace('90ms', '91ms')
     assert starts(reschedule(trace.path, loads(declared, 'd.yaml')).log) == together
 
 
