@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rescheduled: the recorded load through the core, with the same and with other settings."""
 
-from mddag_executor.core import PolicyError
+from mddag_executor.core import NEVER, PolicyError
 from mddag_executor.errors import UsageError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import PREEMPT, Settings, simulate, START
+from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import Load
-from msg_graph import loads
+from msg_graph import loads, Process
 import pytest
 
 from ..simulate.test_run import executions
@@ -137,13 +138,15 @@ nodes:
     trace.run(0, 0, 0, 20, 23, ready=0)
     trace.run(0, 1, 0, 25, 26, leg=1, whole=False)
     trace.run(0, 1, 0, 30, 36)
+    for start in (50, 70):      # an undeclared coroutine
+        trace.piece(-1, -1, -1, start, start + 1, ready=50)
     path = trace.end(90)
     found = [[((start - ns(0)) / MS, (entry[0] - ns(0)) / MS) for start, entry
               in executions(reschedule(path, overheads=overheads).log)]
              for overheads in (False, True)]
-    assert found[0] == [(0, 5), (5, 11), (25, 26)]
+    assert found[0] == [(0, 5), (5, 11), (25, 26), (50, 51), (70, 71)]
     # the message is there 7 ms after the end of its publisher
-    assert found[1] == [(0, 5), (12, 18), (25, 26)]
+    assert found[1] == [(0, 5), (12, 18), (25, 26), (50, 51), (70, 71)]
     result = replay(path).result()
     assert result['callbacks']['/n:a'] == {
         'executions': 1, 'busy_ns': 5 * MS, 'longest_ns': 5 * MS, 'waiting_ns': 0,
@@ -184,7 +187,7 @@ def of_python(path, jobs, cpus=2):
     """
     Record jobs of DAGs of one timer callback each, as they ran from 0 on a worker each.
 
-    :param jobs: end and CPU time (ms), and whether it held the interpreter.
+    :param jobs: end, CPU time (ms) and whether it held the interpreter, if that is recorded.
     """
     callbacks = ', '.join(
         f'{{name: d{dag}, timer: 100ms, deadline: {deadline}ms, dag: d{dag}}}'
@@ -193,8 +196,10 @@ def of_python(path, jobs, cpus=2):
         path, f'mddag: 1\nnodes: [{{node: /n, callbacks: [{callbacks}]}}]', 3, cpus=cpus)
     for dag, _ in enumerate(jobs):
         trace.release(dag, 0, 0)
-    for dag, (end, cpu, held) in enumerate(jobs):
-        trace.run(dag, 0, 0, 0, end, worker=dag, computed=(cpu * MS, held))
+        trace.release(dag, 1, 100)
+    for dag, (end, *computed) in enumerate(jobs):
+        trace.run(dag, 0, 0, 0, end, worker=dag, computed=[
+            computed[0] * MS, computed[1]] if computed else ())
     return trace.end(200)
 
 
@@ -219,6 +224,17 @@ def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path):
     # recorded with one CPU they took turns
     of_python(path, [(21, 12, False), (24, 12, False)], cpus=1)
     assert responses(path, cpus=2) == [12, 12]
+    # what computed a little waited for something else
+    assert responses(of_python(path, [(20, 4, False)])) == [20]
+    # of two that held the interpreter at the same time each waited for the other
+    assert sorted(responses(of_python(path, [(20, 10, True), (20, 10, True)]))) == [10, 20]
+    # what did not run is like the others, of which half of the time was CPU time
+    load = reschedule(of_python(path, [(10, 5, True)])).work.load
+    assert (load.costs[1], load.computed[1], load.holds[1]) == (10 * MS, 5 * MS, 1)
+    # what is declared to hold the interpreter computes, though another CPU time is not recorded
+    of_python(path, [(12,), (12, 12, False)])
+    declared = declared.replace('holds_interpreter: true, dag: d1', 'dag: d1')
+    assert sorted(responses(path, task_set=loads(declared, 'g.yaml'), cpus=1)) == [22, 24]
 
 
 SELDOM = """\
@@ -269,6 +285,10 @@ def test_what_was_not_published_is_not_published_again(computes, tmp_path, call)
         # 8 ms in each of 40 jobs, but 1 ms less in those without an object
         assert again['utilisation'] * again['workers'] * again['duration_ns'] == \
             pytest.approx((40 * 7 + 14) * MS)
+    # a message that crosses processes only then takes the usual time
+    apart = Process('p', ('/camera', '/other')), Process('q', ('/detect', '/brake'))
+    delays = reschedule(path, processes=lambda *of: apart).work.load.delays
+    assert (set(delays[::2]), set(delays[1::2])) == ({DELAY_NS}, {0, NEVER})
 
 
 # --- overheads -----------------------------------------------------------------------------------
@@ -293,6 +313,16 @@ nodes:
     medians = [reschedule(trace.path, workers=workers).result()['dags']['short']['sinks'][
         '/n:short']['response_ns']['median'] for workers in (1, 2)]
     assert medians == [71 * MS, MS]
+    # the only worker notices nothing while another callback runs, which another one had noticed
+    trace = Written(trace.path, replay(trace.path).task_set.text, 2)
+    trace.release(0, 0, 0)
+    trace.release(1, 0, 10, noticed=30)
+    trace.run(1, 0, 0, 31, 32, ready=30, worker=1)
+    trace.run(0, 0, 0, 0, 80)
+    trace.end(100)
+    for workers, ready in ((1, 10), (2, 30)):
+        load = reschedule(trace.path, workers=workers).work.load
+        assert load.times.tolist() == [ns(0), ns(ready)]
 
 
 CHAIN = """\
