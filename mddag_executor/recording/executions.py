@@ -72,7 +72,8 @@ class Numbering:
 
     def one(self, dag: int, vertex: int) -> int:
         """Return a global vertex; -1 if unknown."""
-        return int(self.of(np.array(dag), np.array(vertex))[1])
+        known = 0 <= dag < len(self._sizes) - 1 and 0 <= vertex < self._sizes[dag]
+        return int(self._first[dag]) + vertex if known else -1
 
 
 class Columns:

@@ -22,7 +22,7 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.memory import give_back
-from mddag_executor.recording.entities import Entities, OWN_INIT_EVENTS
+from mddag_executor.recording.entities import Entities, OWN_INIT_EVENTS, signed
 from mddag_executor.recording.executions import (
     Columns,
     COMPLETE,
@@ -304,7 +304,8 @@ class _Source:
             if event[0] == _DROP:
                 _, now, _, _, _, dag, vertex, job, reason = event
                 number = reasons.setdefault(reason, len(reasons))
-                drops.append((self._numbering.one(dag, vertex), job, now, number))
+                drops.append((
+                    self._numbering.one(dag, vertex), signed(job), signed(now), number))
             elif event[0] == _HOSTED:
                 vertices = self._hosted(event)
                 if vertices is not None:

@@ -9,7 +9,7 @@ from mddag_executor.recording.tables import ALL_LEGS, VERTEX
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run import open_recording
 from mddag_executor.report.replays import times_tables
-from mddag_executor.trace import reading, TraceFile, TraceReader
+from mddag_executor.trace import EVENTS, EventType, reading, TraceFile, TraceReader
 from msg_graph import loads
 import pytest
 
@@ -279,6 +279,15 @@ def test_a_process_with_vertices_that_are_not_declared(trace, vertices):
     trace.add('hosted', 0, 0, vertices)
     assert replay(trace.end(110)).warnings[0].endswith(
         '1 event that make no sense, most often (1) mddag:hosted of a vertex that is not declared')
+
+
+def test_a_drop_may_have_numbers_of_other_widths(trace):
+    fields = [(name, kind if kind == 'string' else 'uint64')
+              for name, kind in EVENTS['mddag:drop'].fields]
+    key = trace.file.define(EventType('mddag', 'drop', tuple(fields)))
+    trace.file.add(key, ns(1), 1, 1, *([2 ** 64 - 1] * 4), 'aborted')
+    drops = open_recording(trace.end(110)).drops
+    assert drops[['vertex', 'job']].tolist() == [(-1, -1)]
 
 
 def test_a_trace_without_a_usable_declaration(tmp_path):
