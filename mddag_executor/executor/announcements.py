@@ -52,7 +52,6 @@ from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.work import Work
 from msg_graph import TaskSet
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.context import Context
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
@@ -76,9 +75,7 @@ class Announcements:
     :param pool: its engine is used; all but ``unmatched`` and ``close`` needs its lock.
     """
 
-    def __init__(
-        self, task_set: TaskSet, process: str, context: Context, pool: WorkerPool,
-    ) -> None:
+    def __init__(self, task_set: TaskSet, process: str, pool: WorkerPool) -> None:
         self._pool = pool
         self._jobs = pool.engine.jobs
         self._engine = pool.engine
@@ -95,7 +92,7 @@ class Announcements:
         names = [each.name for each in task_set.processes]
         own = names.index(process)
         self.node = quiet_node(
-            f'_mddag_jobs_{os.getpid()}_{own}', context, is_remapped=True)
+            f'_mddag_jobs_{os.getpid()}_{own}', pool.executor.context, is_remapped=True)
         self._n_others = len(names) - 1
         self._publisher: Publisher | None = self.node.create_publisher(
             UInt8MultiArray, f'/mddag/jobs_{digest}/p{own}', _QOS)

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from mddag_executor.executor.registry import Registry
     from mddag_executor.executor.workers import WorkerPool
     from msg_graph import Dag, TaskSet
-    from rclpy.context import Context
 
 TOPIC = '/diagnostics'
 WORKERS = 'workers'
@@ -240,11 +239,11 @@ class Diagnostics:
     """Publishes the state of an executor, from a separate thread."""
 
     def __init__(
-        self, context: Context, task_set: TaskSet | None, pool: WorkerPool, registry: Registry,
-        recorder: Recorder | None, period_ns: int, thresholds: Thresholds,
-        process: str | None = None, notifier: MissNotifier | None = None,
+        self, task_set: TaskSet | None, pool: WorkerPool, registry: Registry,
+        recorder: Recorder | None, period_ns: int, thresholds: Thresholds, process: str | None,
+        notifier: MissNotifier | None,
     ) -> None:
-        self._context = context
+        self._context = pool.executor.context
         self._registry = registry
         self._period_ns = period_ns
         self._hardware_id = f'{socket.gethostname()}/{process or os.getpid()}'

@@ -527,8 +527,7 @@ class Engine:
                 return True
             if first is None or entry < first:
                 first = entry
-        return (first is not None
-                and first[0] < min(state.x_key[work.x][0] for work in self.holders)
+        return (first is not None and first[0] < state.x_key[self.holders[-1].x][0]
                 and bool(self._may_be_overtaken(now)))
 
     # --- the GIL ---------------------------------------------------------------------------------
@@ -565,11 +564,8 @@ class Engine:
         return bound, now + left + max(TURN_NS, bound // PATIENCE)
 
     def interpreter_holder(self) -> Work | None:
-        """Return the most urgent execution that holds the interpreter."""
-        holders = self.holders
-        if len(holders) < 2:
-            return holders[0] if holders else None
-        return min(holders, key=lambda work: self._state.x_key[work.x])
+        """Return the most urgent execution that holds the interpreter: the latest to overtake."""
+        return self.holders[-1] if self.holders else None
 
     def _let_go(self, work: Work) -> None:
         if work in self.holders:

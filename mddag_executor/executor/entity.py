@@ -7,16 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable as Callable_
 from collections.abc import Mapping
 import functools
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.jobs import new_address
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
-
-if TYPE_CHECKING:
-    from mddag_executor.executor.work import Gate
 
 TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
     'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
@@ -105,8 +102,8 @@ class Entity:
         # called when the answer whether it holds the GIL is known or changes; the last answer
         self.classify: Callable_[[], None] | None = None
         self.is_nested = 0
-        # its callback group, if that must be asked whether it may run
-        self.gate: Gate | None = None
+        # runs a step in its callback group, if that must be asked (``work.step_in_group``)
+        self.gate: Callable_[..., Any] | None = None
         self.address = new_address()
         # entered before a callback runs: it raises once the entity is destroyed
         self.handle = rclpy.handle if kind in _HAVE_HANDLES else None

@@ -206,12 +206,12 @@ class MultiDeadlineExecutor(BareExecutor):
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
             self._diagnostics = Diagnostics(
-                self.context, task_set, self._pool, self._registry, self._recorder, every_ns,
+                task_set, self._pool, self._registry, self._recorder, every_ns,
                 thresholds or Thresholds(), process, self._notifier)
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
-            self._announcements = Announcements(task_set, process, self.context, self._pool)
+            self._announcements = Announcements(task_set, process, self._pool)
             self._pool.announcements = self._announcements
             self._registry.own = {*self._announcements.subscriptions}
         # Otherwise ready callbacks would run before the spin notices.

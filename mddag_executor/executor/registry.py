@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 import threading
 from typing import Any
 import weakref
@@ -25,7 +26,7 @@ from mddag_executor.executor.entity import (
     WAITABLE,
 )
 from mddag_executor.executor.sources import SERVICE_DEPTH
-from mddag_executor.executor.work import decides_itself, Gate, Work
+from mddag_executor.executor.work import decides_itself, step_in_group, Work
 from msg_graph import binding, Callback, TaskSet
 from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -246,7 +247,7 @@ class Registry:
         number = self._number(rclpy_entity if decides else group)
         entity = Entity(kind, rclpy_entity, node, callback, number, depth, label)
         if decides:
-            entity.gate = Gate(group, rclpy_entity, self._passed)
+            entity.gate = partial(step_in_group, group, rclpy_entity, self._passed)
         if kind == SUBSCRIPTION and depth == 0:
             entity.most_waiting = MOST
         elif kind == SERVICE:

@@ -176,25 +176,23 @@ def decides_itself(group: Any) -> bool:
         for kind in (MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup))
 
 
-class Gate:
-    """The user-defined callback group of an entity; ``passed`` gets executions before they run."""
+def step_in_group(
+    group: Any, entity: Any, passed: Callable[[Work], None], work: Work, must_check: bool = True
+) -> Any:
+    """
+    Run a step of an execution as ``Work.step`` does, or raise Refused.
 
-    def __init__(self, group: Any, entity: Any, passed: Callable[[Work], None]) -> None:
-        self._group = group
-        self._entity = entity
-        self._passed = passed
-
-    def step(self, work: Work, must_check: bool = True) -> Any:
-        """Run a step of an execution as ``Work.step`` does, or raise Refused."""
-        group, entity = self._group, self._entity
-        if work.coroutine is None:
-            if not (group.can_execute(entity) and group.beginning_execution(entity)):
-                raise Refused
-            self._passed(work)
-        waits_for = None
-        try:
-            waits_for = work.step(must_check)
-        finally:
-            if waits_for is None:
-                group.ending_execution(entity)
-        return waits_for
+    :param group: the user-defined callback group of rclpy's entity.
+    :param passed: called before an execution runs.
+    """
+    if work.coroutine is None:
+        if not (group.can_execute(entity) and group.beginning_execution(entity)):
+            raise Refused
+        passed(work)
+    waits_for = None
+    try:
+        waits_for = work.step(must_check)
+    finally:
+        if waits_for is None:
+            group.ending_execution(entity)
+    return waits_for

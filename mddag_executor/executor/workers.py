@@ -619,7 +619,7 @@ class WorkerPool:
         start = monotonic_ns()
         try:
             me.outcome = (
-                work.step(must_check) if gate is None else gate.step(work, must_check))
+                work.step(must_check) if gate is None else gate(work, must_check))
         except BaseException as error:
             me.outcome = error
         end = monotonic_ns()
