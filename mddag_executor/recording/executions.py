@@ -34,9 +34,11 @@ from mddag_executor.recording.tables import (
     Growing,
     Ints,
     LEG,
+    look_up,
     Mask,
     NOTHING,
     rows,
+    rows_by,
     sort_by,
     Table,
     UNKNOWN,
@@ -328,11 +330,12 @@ def running_at(
     completed_at = np.full(len(executions), UNKNOWN)
     completed_at[completed['row']] = completed['place']
     ran = np.flatnonzero((executions['end'] >= 0) & (executions['start'] >= 0))
-    threads = executions['thread'][ran]
-    for number in np.unique(thread).tolist():
-        asked, mine = np.flatnonzero(thread == number), ran[threads == number]
-        if not len(mine):
+    numbers, which = different(executions['thread'][ran])
+    for asked, mine in zip(*(rows_by(each, len(numbers)) for each in (
+            look_up(numbers, thread), which))):
+        if not len(asked):
             continue
+        mine = ran[mine]
         start, end = executions['start'][mine], executions['end'][mine]
         if (start[1:] <= start[:-1]).any():
             order = sort_by(start, -end)
