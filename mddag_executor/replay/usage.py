@@ -101,17 +101,18 @@ class PoolUse:
         self.step = step
         self.start: int | None = None
         self.busy: list[int] = []
-        borders = [(int(begin.min()), int(end.max()) - 1) for begin, end in _spans(starts, ends)]
-        if not borders:
+        spans = list(_spans(starts, ends))
+        if not spans:
             return
-        first, last = min(first for first, _ in borders), max(last for _, last in borders)
+        first = min(int(start.min()) for start, _ in spans)
+        last = max(int(end.max()) for _, end in spans) - 1
         while last // self.step - first // self.step >= self.MOST_STEPS:
             self.step *= 2
         number = first // self.step
         self.start = number * self.step
         steps = (number + np.arange(last // self.step - number + 2)) * self.step
         busy = np.zeros(len(steps) - 1, dtype=np.int64)
-        for each in _spans(starts, ends):
+        for each in spans:
             busy += Spans(*each).within(steps[:-1], steps[1:])
         self.busy = busy.tolist()
 
