@@ -98,17 +98,6 @@ class _Chain(NamedTuple):
             sums=self.sums + np.where(good, before.until(ready), 0))
 
 
-class _Dag(NamedTuple):
-    """
-    The chains of a DAG, by (local) vertex and job; -1: none.
-
-    :ivar row: the row of the execution; ``before``: the previous vertex of the chain.
-    """
-
-    row: Any
-    before: Any
-
-
 class Chains:
     """
     The chains of a judged recording.
@@ -130,7 +119,7 @@ class Chains:
         self._is_other = self._started.copy()
         for jobs in judged.jobs:
             self._is_other[jobs.done] = False
-        self._dags: dict[int, _Dag] = {}
+        self._dags: dict[int, tuple[Any, Any]] = {}
         self._breakdown: dict[int, dict[str, Any]] = {}
 
     # --- links -----------------------------------------------------------------------------------
@@ -171,12 +160,18 @@ class Chains:
             found[name] = np.where(running, NEVER, table[name])
         return found
 
-    def _of_dag(self, dag: int) -> _Dag:
-        """Find the chains of a DAG, and the breakdown of its sinks."""
+    def _of_dag(self, dag: int) -> tuple[Any, Any]:
+        """
+        Find the chains of a DAG, and the breakdown of its sinks.
+
+        :return: by vertex and job the row of the execution, and the previous vertex of the chain;
+            -1: none.
+        """
         if dag in self._dags:
             return self._dags[dag]
         task, row = self._judged.task_set.dags[dag], self._rows(dag)
-        found = self._dags[dag] = _Dag(row, np.full(row.shape, -1, dtype=np.int16))
+        before = np.full(row.shape, -1, dtype=np.int16)
+        self._dags[dag] = row, before
         chains: dict[int, _Chain] = {}
         for v in topological_order(task):
             links, legs = self._links(dag, v, row[v]), self._legs[dag][v]
@@ -188,22 +183,22 @@ class Chains:
                 row[v] >= 0, start, end, pause, ready, np.ones_like(ready, np.bool_),
                 np.array([start - ready, zero, zero, links['group']]))
             if legs:
-                leg, before = _published([chains[each] for each in legs], leg, ready)
-                good, chain = chain.after(before, ready)
-                found.before[v] = np.where(good, np.array(legs)[leg], -1)
+                leg, published = _published([chains[each] for each in legs], leg, ready)
+                good, chain = chain.after(published, ready)
+                before[v] = np.where(good, np.array(legs)[leg], -1)
             if v in task.sinks:
                 self._add_breakdown(dag, v, chain)
             chains[v] = chain
-        return found
+        return row, before
 
     def _follow(self, dag: int, which: Ints, vertex: Ints, job: Ints) -> Iterator[Table]:
         """Yield the links of chains from last to first; ``which``: numbers of the chains."""
-        of = self._of_dag(dag)
+        row, before = self._of_dag(dag)
         while len(which):
-            links = self._links(dag, vertex, of.row[vertex, job])
+            links = self._links(dag, vertex, row[vertex, job])
             links['of'] = which
             yield links
-            vertex = of.before[vertex, job]
+            vertex = before[vertex, job]
             more = vertex >= 0
             which, vertex, job = which[more], vertex[more], job[more]
 
@@ -220,7 +215,7 @@ class Chains:
         legs = self._legs[dag]
         width = max(1, *map(len, legs))
         before = np.array([each + [-1] * (width - len(each)) for each in legs])
-        row = self._of_dag(dag).row[:, missed['row']].T
+        row = self._of_dag(dag)[0][:, missed['row']].T
         row[self._executions['began'][row] > missed['until'][:, None]] = -1
         end = np.where(self._is_other[row], NEVER, self._executions['end'][row])
         every, at = np.arange(len(missed)), missed['sink'] - self._first[dag]
