@@ -46,7 +46,6 @@ Deadlines = dict[str, int]
 """Relative deadlines of sinks, ns, by their callbacks' keys."""
 
 
-
 class Measured(NamedTuple):
     """The acceptance of some deadlines."""
 
@@ -95,10 +94,9 @@ def proportional(task_set: TaskSet, budget: str) -> Deadlines:
     """
     deadlines: Deadlines = {}
     for task in tasks_of(task_set, budget):
-        longest = max(length for _, _, length in task.sinks)
         for index, _, length in task.sinks:
             key = task.dag.vertices[index].callback.key
-            deadline = whole_us(task.period * (length / longest if longest else 1.0))
+            deadline = whole_us(task.period * (length / task.length if task.length else 1.0))
             deadlines[key] = min(deadline, deadlines.get(key, deadline))
     return deadlines
 

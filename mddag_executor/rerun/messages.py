@@ -70,8 +70,6 @@ class Outlet:
     :ivar kept: what later subscriptions get, with the times of publication.
     """
 
-    __slots__ = ('publisher', 'kind', 'state', 'subscriptions', 'kept')
-
     def __init__(self, publisher: Any) -> None:
         self.publisher = publisher
         self.kind = publisher.msg_type

@@ -129,6 +129,7 @@ class Rerun:
         self.task_set = replace(self.task_set, processes=())  # all nodes run in one
         self._outputs = Outputs(self.output, None if self.keep else self.recording.topics)
         self._hosted: set[str] = set()
+        self._triggered: list[GuardCondition] = []  # whose nodes are not known yet
 
     # --- parts -----------------------------------------------------------------------------------
 
@@ -177,12 +178,18 @@ class Rerun:
     def _trigger(self, original: Callable[[GuardCondition], None]) -> Callable[..., None]:
         def trigger(guard: GuardCondition) -> None:
             original(guard)
-            entity = self._registry.by_id.get(id(guard))
-            if entity is None:  # of an executor: entities have come or gone
+            if guard.callback is None:  # of an executor: entities have come or gone
                 self._loop.changed = True
-            elif guard.callback is not None:
-                work = Work(entity, guard.callback)
-                self._loop.call_in_run(lambda: self._engine.ready(work, self._loop.now))
+            else:
+                self._loop.call_in_run(lambda: run_callback(guard))
+
+        def run_callback(guard: GuardCondition) -> None:
+            entity = self._registry.by_id.get(id(guard))
+            if entity is None:  # it has just been made
+                self._triggered.append(guard)
+                self._loop.changed = True
+            else:
+                self._engine.ready(Work(entity, guard.callback), self._loop.now)
 
         return trigger
 
@@ -196,6 +203,9 @@ class Rerun:
             self._other_processes.host(hosted, registry.subscriptions(), engine.record, now)
         for entity in added:
             entity.since = now
+            if entity.rclpy in self._triggered:
+                self._triggered.remove(entity.rclpy)
+                engine.ready(Work(entity, entity.rclpy.callback), now)
             if entity.callback is not None and entity.callback.key in self._holders:
                 entity.habit.holds = 1
             if entity.kind == WAITABLE and not self._requests.knows(entity.rclpy) and (

@@ -9,11 +9,12 @@ The orders of reading and the handling of damage are in `reading`.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 import os
 import stat
 import struct
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO
 import warnings
 import weakref
 
@@ -25,9 +26,6 @@ from mddag_executor.trace.events import Batch, Event
 from mddag_executor.trace.reading import Message, Reading
 from mddag_executor.trace.records import LIBRARY
 from mddag_executor.trace.schema import PROCESS
-
-_T = TypeVar('_T')
-_Way = Callable[[Reading], Iterator[_T]]
 
 
 def _opened(path: str) -> BinaryIO:
@@ -133,12 +131,12 @@ class TraceReader:
     def _events(
         self, names: Iterable[str] | None, as_table: bool, in_order: bool
     ) -> Iterator[Event]:
-        channels = Channels(None if names is None else set(names), as_table)
-        if in_order:
-            yield from self._read(channels, Reading.by_time)
-        else:
-            for batch in self._read(channels, Reading.by_file):
-                yield from batch.tuples()
+        with self._reading(Channels(None if names is None else set(names), as_table)) as reading:
+            if in_order:
+                yield from reading.by_time()
+            else:
+                for batch in reading.by_file():
+                    yield from batch.tuples()
 
     def batches(self, names: Iterable[str], as_table: bool = True) -> Iterator[Batch]:
         """
@@ -146,18 +144,20 @@ class TraceReader:
 
         :param as_table: whether they have the fields of the table, not those of the file.
         """
-        return self._read(Channels(set(names), as_table), Reading.by_file)
+        with self._reading(Channels(set(names), as_table)) as reading:
+            yield from reading.by_file()
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the undecoded messages of some topics, in the order of the file."""
-        return self._read(
-            Channels(set(), True), lambda reading: reading.messages_of(topics, self.times))
+        with self._reading(Channels(set(), True)) as reading:
+            yield from reading.messages_of(topics, self.times)
 
-    def _read(self, channels: Channels, way: _Way[_T]) -> Iterator[_T]:
+    @contextmanager
+    def _reading(self, channels: Channels) -> Iterator[Reading]:
         self.fields, self.topics = channels.fields, channels.topics
         try:
             reading = Reading(self.path, channels, self._stream, self._start, self._size)
-            yield from way(reading)
+            yield reading
         except OSError as error:
             raise unreadable(self.path, error) from None
         for text in (self._missing(reading), reading.undecoded(), reading.impossible_times()):

@@ -339,8 +339,10 @@ def test_simulated_time_is_that_of_the_recording(tmp_path, graph):
 
 
 def test_who_is_there_is_known_at_once(bag, graph):
+    """Also a guard condition that is triggered where it is made."""
     def fill(node):
         node.create_publisher(String, '/names', 10)
+        node.create_guard_condition(lambda: node.note('guard')).trigger()
         node.note(node.count_publishers('/points'))
 
     def take(node, number):
@@ -353,7 +355,8 @@ def test_who_is_there_is_known_at_once(bag, graph):
         return node
 
     seen, _ = run_filter(bag, graph, take, other, fill=fill)
-    assert seen == [(0.0, 1), (100.0, (1, 2))]  # the rerun subscribes, too
+    # the rerun subscribes, too
+    assert seen == [(0.0, 1), (0.0, 'guard'), (100.0, (1, 2))]
 
 
 STALLS = """\
