@@ -30,8 +30,8 @@ MOST_MISSES = 500
 MOST_LINES = 150
 """Maximum number of lines of the timeline by callback."""
 LONGEST_LABEL = 40
-UNKNOWN = '#969696'
-COLOURS = ('#d7191c', '#fd8d3c', '#fec44f', '#9ecae1', '#3182bd', UNKNOWN)
+RED, ORANGE, BLUE, UNKNOWN = '#d7191c', '#fd8d3c', '#3182bd', '#969696'
+COLOURS = (RED, ORANGE, '#fec44f', '#9ecae1', BLUE, UNKNOWN)
 """The colours of executions, from the least slack to the most, and without a verdict."""
 _SHARES = (0.0, 0.1, 0.25, 0.5)
 """Thresholds between the colours: slack as a share of the deadline."""

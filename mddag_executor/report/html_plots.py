@@ -24,7 +24,16 @@ from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 from bokeh.themes import Theme
 from mddag_executor.replay.usage import PoolUse
-from mddag_executor.report.html_data import COLOURS, label, Line, Prepared, ReportData, seconds
+from mddag_executor.report.html_data import (
+    BLUE,
+    COLOURS,
+    label,
+    Line,
+    Prepared,
+    RED,
+    ReportData,
+    seconds,
+)
 from mddag_executor.report.tables import short_names
 from mddag_executor.report.text import format_ns
 import numpy as np
@@ -34,7 +43,6 @@ _LEFT = 270             # room for the labels, the same in all timelines, so tha
 _LINE = 16              # height of a line of a timeline, pixels
 _TOOLTIP = ('<div style="max-width:46em"><b>@a</b><br>@b<br>@c<br>@d</div>')
 _ZOOM = 'xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save'
-_RED, _BLUE = '#d7191c', '#3182bd'
 
 THEME = Theme(json={'attrs': {
     'Plot': {'outline_line_color': '#bbbbbb', 'min_border_right': 24},  # half of the last label
@@ -76,11 +84,11 @@ def _overview(data: ReportData, time: Range1d) -> Any:
         min_border_left=_LEFT, name='overview')
     edges, busy = _over_time(data, data.timeline.busy_over_time)
     plot.quad(left=edges[:-1], right=edges[1:], bottom=0, top=busy,
-              fill_color=_BLUE, line_color=None)
+              fill_color=BLUE, line_color=None)
     edges, missed = _over_time(data, data.timeline.missed_over_time)
     late = missed > 0
     plot.quad(left=edges[:-1][late], right=edges[1:][late], bottom=workers * 1.02,
-              top=workers * 1.08, fill_color=_RED, line_color=_RED, line_width=3)
+              top=workers * 1.08, fill_color=RED, line_color=RED, line_width=3)
     plot.yaxis.axis_label = 'busy workers'
     plot.xaxis.axis_label = 'time (s)'
     tool = RangeTool(x_range=time)
@@ -128,7 +136,7 @@ def _timeline(
                      fill_color=by_class, line_color=by_class, line_width=0.5)
     plot.add_tools(HoverTool(renderers=[bars], tooltips=_TOOLTIP, point_policy='follow_mouse'))
     marked = plot.scatter('x', name, source=marks, marker='inverted_triangle', size=9,
-                          fill_color=_RED, line_color='#ffffff')
+                          fill_color=RED, line_color='#ffffff')
     plot.add_tools(HoverTool(renderers=[marked], tooltips=_TOOLTIP))
     plot.yaxis.ticker = FixedTicker(ticks=[line.y for line in lines])
     plot.yaxis.major_label_overrides = {line.y: line.label for line in lines}
@@ -168,12 +176,12 @@ def _histogram(title: str, tally: Any) -> Any:
     plot.y_range.start = 0
     source = ColumnDataSource({
         'left': left / scale, 'right': (left + width) / scale, 'top': counts[counts > 0],
-        'colour': np.where(late, _RED, _BLUE).tolist()})
+        'colour': np.where(late, RED, BLUE).tolist()})
     bars = plot.quad(left='left', right='right', bottom=0, top='top', source=source,
                      fill_color='colour', line_color='#ffffff', line_width=0.5)
     plot.add_tools(HoverTool(renderers=[bars], tooltips=[
         ('response', f'@left{{0.[000]}} to @right{{0.[000]}} {unit}'), ('jobs', '@top')]))
-    plot.add_layout(Span(location=deadline / scale, dimension='height', line_color=_RED,
+    plot.add_layout(Span(location=deadline / scale, dimension='height', line_color=RED,
                          line_dash='dashed', line_width=2))
     plot.x_range.start = 0
     plot.x_range.end = max(deadline * 1.06, float((left + width).max()) * 1.02) / scale

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 
 from mddag_executor.core.tally import counts, total, VERDICTS
-from mddag_executor.report.html_data import Prepared, ReportData, seconds
+from mddag_executor.report.html_data import BLUE, ORANGE, Prepared, RED, ReportData, seconds
 from mddag_executor.report.replays import callbacks_table, times_table
 from mddag_executor.report.tables import (
     each_sink,
@@ -24,7 +24,6 @@ from mddag_executor.text import counted
 _STYLE = Path(__file__).with_name('html.css')
 MOST_ROWS = 50
 """Number of sinks in the page itself; a script adds the others."""
-RED, ORANGE, BLUE = '#d7191c', '#fd8d3c', '#3182bd'
 
 
 class Html(str):

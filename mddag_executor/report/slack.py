@@ -9,15 +9,8 @@ from html import escape
 import math
 from typing import Any
 
-from mddag_executor.report.html_tables import (
-    bar,
-    BLUE,
-    Html,
-    html_table,
-    ORANGE,
-    page_head,
-    RED,
-)
+from mddag_executor.report.html_data import BLUE, ORANGE, RED
+from mddag_executor.report.html_tables import bar, Html, html_table, page_head
 from mddag_executor.report.tables import percent, short_names, times
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
