@@ -18,9 +18,9 @@ from mddag_executor.errors import InputError
 def find(name: str) -> Path:
     """Return the path of a shipped file (its name is from the top), or raise InputError."""
     # PREFIX/lib/python3.12/site-packages, and Debian's PREFIX/local/lib/…
-    top, _, _, *prefixes = Path(__file__).resolve().parent.parents
+    top, *above = Path(__file__).resolve().parent.parents
     # `pip install --target` makes the package's folder the prefix
-    for root in (top, *(each / 'share' / 'mddag_executor' for each in (top, *prefixes[:2]))):
+    for root in (top, *(each / 'share' / 'mddag_executor' for each in (top, *above[2:4]))):
         if (root / name).exists():
             return root / name
     raise InputError(name, 'not found among the files that ship with mddag_executor',

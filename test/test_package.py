@@ -37,6 +37,12 @@ def test_a_checkout_has_its_own_files():
         resources.find('config/none.yaml')
 
 
+def test_a_checkout_may_be_a_folder_of_the_root(monkeypatch):
+    monkeypatch.setattr(resources, '__file__', '/no_src/mddag_executor/resources.py')
+    with pytest.raises(InputError):
+        resources.find('package.xml')
+
+
 @pytest.mark.parametrize('folder', [
     'lib/python3.12/site-packages', 'local/lib/python3.12/dist-packages', ''])
 def test_an_installation_has_its_own_files(tmp_path, folder):
