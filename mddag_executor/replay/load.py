@@ -362,7 +362,7 @@ class LoadBuilder:
         more = np.zeros(len(others), dtype=np.int64)
         number = others[:, 2]
         costs = np.concatenate([took, np.maximum(0, others[:, 1]) + np.where(
-            number >= 0, every[number], 0)])
+            (number >= 0) & overheads, every[number], 0)])
         columns: dict[str, Any] = {
             'holds': np.concatenate([held, more]) if held.any() else []}
         if len(self._recording.executions):

@@ -139,14 +139,14 @@ nodes:
     trace.run(0, 1, 0, 25, 26, leg=1, whole=False)
     trace.run(0, 1, 0, 30, 36)
     for start in (50, 70):      # an undeclared coroutine
-        trace.piece(-1, -1, -1, start, start + 1, ready=50)
+        trace.piece(-1, -1, -1, start, start + 1, ready=49)
     path = trace.end(90)
     found = [[((start - ns(0)) / MS, (entry[0] - ns(0)) / MS) for start, entry
               in executions(reschedule(path, overheads=overheads).log)]
              for overheads in (False, True)]
-    assert found[0] == [(0, 5), (5, 11), (25, 26), (50, 51), (70, 71)]
+    assert found[0] == [(0, 5), (5, 11), (25, 26), (49, 50), (70, 71)]
     # the message is there 7 ms after the end of its publisher
-    assert found[1] == [(0, 5), (12, 18), (25, 26), (50, 51), (70, 71)]
+    assert found[1] == [(0, 5), (12, 18), (25, 26), (49, 51), (70, 71)]
     result = replay(path).result()
     assert result['callbacks']['/n:a'] == {
         'executions': 1, 'busy_ns': 5 * MS, 'longest_ns': 5 * MS, 'waiting_ns': 0,
