@@ -39,6 +39,7 @@ class GuestExecutor:
     :ivar guest: the program; None when a callback has made the executor.
     :ivar is_global: whether it is the executor of ``rclpy.spin``, which removes a node after each
         use.
+    :ivar has_spun: whether its nodes run, also those that are added later.
     """
 
     host: Host
@@ -46,7 +47,8 @@ class GuestExecutor:
     is_global = False
     _changed: threading.Condition
     _errors: deque[BaseException]
-    _has_spun = _is_stopped = False
+    has_spun = False
+    _is_stopped = False
     _turns = 0  # callbacks that have run since the last spin
     _n_stepping = _n_spinning = 0
 
@@ -93,7 +95,7 @@ class GuestExecutor:
                 self._turns = max(0, self._turns - 1)
 
     def _wait(self, until: Callable[[], bool], timeout_sec: Any) -> None:
-        self._has_spun = True
+        self.has_spun = True
         self._adopt(Executor.get_nodes(self))  # type: ignore[arg-type]
         raised: list[BaseException] = []
 
@@ -147,14 +149,14 @@ class GuestExecutor:
         if self.guest is None and self.is_global and isinstance(node.executor, GuestExecutor):
             return False  # rclpy.spin_once in a callback: the node stays with its program
         added: bool = Executor.add_node(self, node)  # type: ignore[arg-type]
-        if added and self._has_spun:
+        if added and self.has_spun:
             self._adopt([node])
         return added
 
     def remove_node(self, node: Node) -> None:
         """Remove a node."""
         Executor.remove_node(self, node)  # type: ignore[arg-type]
-        if self._has_spun and not self.is_global:
+        if self.has_spun and not self.is_global:
             self.host.release(node, self.guest)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:

@@ -211,6 +211,8 @@ class Host:
             for node in nodes:
                 if node.executor is None:
                     self._global_executor().add_node(node)
+                executor: Any = node.executor
+                executor.has_spun = True    # callbacks may add more nodes to it
                 self.adopt(node, guest)
         except SystemExit as error:
             if error.code not in (None, 0):

@@ -48,7 +48,15 @@ def main():
 
 
 def two():
-    return [Listener('first'), Node('idle')]
+    node = Node('adds_another')
+
+    def add():
+        timer.cancel()
+        node.another = Listener('another')
+        node.executor.add_node(node.another)
+
+    timer = node.create_timer(0.05, add)
+    return [Listener('first'), node]
 
 
 def spins_in_thread():
