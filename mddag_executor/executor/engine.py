@@ -237,7 +237,8 @@ class Engine:
         last = next(reversed(entity.waiting), -1)
         if last >= 0 and self._state.x_holds[last] != holds:  # one would overtake the other
             for x in entity.waiting:
-                self.scheduler.set_holds(x, holds)
+                if x >= 0:  # else it bypasses the core for the moment
+                    self.scheduler.set_holds(x, holds)
         return holds
 
     def allow_bypass(self) -> None:

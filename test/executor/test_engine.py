@@ -214,6 +214,20 @@ def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_mo
     assert engine.dispatch(1, 1) is messages[0]
 
 
+def test_another_thread_may_learn_of_a_callback_while_the_bypass_ends():
+    engine, user = new_engine(), new_entity()
+    user.wall_ns = 0
+    engine.allow_bypass()
+    for _ in range(4):
+        engine.ready(Work(user, print), 0)
+    assert engine.dispatch(0, 0) is not None
+    answers = iter((0, 0, 1, 1))
+    user.habit = type('Habit', (), {'holds': property(lambda habit: next(answers))})()
+    assert not engine.may_start_more(0)
+    engine.validate()
+    assert {engine._state.x_holds[x] for x in user.waiting} == {1}
+
+
 @examples(150)
 @given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
 def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
