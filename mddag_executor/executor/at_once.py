@@ -113,18 +113,17 @@ class SignalPipe(ChannelSource):
     @contextmanager
     def watch(self) -> Iterator[None]:
         """Watch for signals while entered in the main thread, unless something else does."""
-        if self.fd < 0 or threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        other = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
-        if other >= 0:  # asyncio's, or that of a spin which has called this one
-            signal.set_wakeup_fd(other, warn_on_full_buffer=False)
-            yield
-            return
+        watches = self.fd >= 0 and threading.current_thread() is threading.main_thread()
+        if watches:
+            other = signal.set_wakeup_fd(self._write_fd, warn_on_full_buffer=False)
+            if other >= 0:  # asyncio's, or that of a spin which has called this one
+                signal.set_wakeup_fd(other, warn_on_full_buffer=False)
+                watches = False
         try:
             yield
         finally:
-            signal.set_wakeup_fd(-1)
+            if watches:
+                signal.set_wakeup_fd(-1)
 
     def collect(self) -> None:
         """Empty the pipe; the handlers have run already."""
