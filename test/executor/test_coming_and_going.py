@@ -162,6 +162,10 @@ class Brief:
             self.executor.remove_node(node)
 
 
+# A busy machine has more stops, which are bounded, and slots, which are used again: an invariant.
+VARIES = 'State.x_', 'State.job_', 'Deadlines.', 'Stops.'
+
+
 def sizes(executor):
     """Return the sizes of what the executor, and all that it consists of, has."""
     found, seen, todo = Counter(), set(), [executor]
@@ -173,8 +177,10 @@ def sizes(executor):
         for name in (*getattr(owner, '__dict__', ()), *getattr(owner, '__slots__', ())):
             value = getattr(owner, name)
             todo.append(value)
-            if hasattr(value, '__len__') and not isinstance(value, str):
-                found[f'{type(owner).__name__}.{name}'] += len(value)
+            name = f'{type(owner).__name__}.{name}'
+            if (hasattr(value, '__len__') and not isinstance(value, str)
+                    and not name.startswith(VARIES)):
+                found[name] += len(value)
     return found + Counter({
         'deliveries': sum(map(len, publishing._deliveries.values())),
         'events': len(waitables._known), 'descriptors': len(os.listdir('/proc/self/fd'))})
