@@ -218,7 +218,9 @@ class Host:
             if error.code not in (None, 0):
                 guest.error = error
         except BaseException as error:
-            if guest.is_complete or not self._ended:  # else the end of the run cut its start off
+            # the end of the run may cut its start off; what it raises of its own is an error
+            if guest.is_complete or not self._ended or not (
+                    type(error).__module__.startswith('rclpy.')):
                 guest.error = error
         if guest.error is not None or not guest.returned:
             self.program_ended(guest)

@@ -263,12 +263,15 @@ def test_a_program_that_cannot_start(world, default_context, spec, message):
     host.executor.shutdown()
 
 
+@pytest.mark.parametrize(('spec', 'error'), [
+    ('chat:starts_slowly', type(None)), ('chat:fails_after_a_loop', OSError)])
 def test_a_program_whose_start_the_end_of_the_run_cuts_off_has_not_failed(
-        world, default_context, monkeypatch):
+        world, default_context, monkeypatch, spec, error):
+    """But one that never spins, and raises at its end, has."""
     monkeypatch.setattr('mddag_executor.hosting.host.START_TIMEOUT_S', 0.1)
     with Host() as host:
-        host.start(SingleThreadedExecutor(), host.load(['chat:starts_slowly']))
-        assert host.end(30.0) == [] and host.guests[0].error is None
+        host.start(SingleThreadedExecutor(), host.load([spec]))
+        assert host.end(30.0) == [] and type(host.guests[0].error) is error
     host.executor.shutdown()
 
 

@@ -214,6 +214,13 @@ def starts_slowly():
     Node('late')  # the context is shut down
 
 
+def fails_after_a_loop():
+    rclpy.init()
+    while rclpy.ok():
+        time.sleep(0.01)
+    raise OSError
+
+
 def leaves_a_thread():
     threading.Thread(target=time.sleep, args=(60,), name='stubborn', daemon=False).start()
     print('not JSON')
