@@ -115,9 +115,9 @@ def test_sync_completes_with_the_last_leg_and_or_tells_publishers_apart(make_exe
 ORDER = graph(
     source='name: begin, subscription: /start, period: 10s, publishes: [/c, /a, /b], dag: race',
     racer="""
-        name: c, subscription: /c, deadline: 300ms
-        name: a, subscription: /a, deadline: 100ms
-        name: b, subscription: /b, deadline: 200ms""")
+        name: c, subscription: /c, deadline: 30s
+        name: a, subscription: /a, deadline: 10s
+        name: b, subscription: /b, deadline: 20s""")
 
 
 @pytest.mark.parametrize('policy, expected', [('rad', 'abc'), ('gedf', 'cab')])
