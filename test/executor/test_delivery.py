@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages between callbacks of one process: taken by who publishes, and none is lost."""
 
+from concurrent.futures import ThreadPoolExecutor
 import itertools
 import subprocess
 import sys
@@ -138,6 +139,24 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
 
 def numbers(got, name):
     return [int(text.split(':')[1]) for text in got if text.startswith(f'{name}:')]
+
+
+def test_several_threads_publish_and_each_ones_order_is_kept(make_executor, make_node):
+    """At the same time: each takes in what it publishes."""
+    node, got = make_node(), []
+    node.create_subscription(Header, '/a', lambda m: got.append(m.frame_id), 5000)
+    publishers = [node.create_publisher(Header, '/a', 5000) for _ in range(4)]
+
+    def publish(name):
+        for number in range(200):
+            publishers[name].publish(Header(frame_id=f'{name}:{number}'))
+
+    with Spinning(make_executor(nodes=[node])), ThreadPoolExecutor() as pool:
+        matched(*publishers)
+        list(pool.map(publish, range(4)))
+        assert wait_for(lambda: len(got) >= 800), len(got)
+    for name in range(4):
+        assert numbers(got, name) == list(range(200))
 
 
 @pytest.mark.parametrize('waits', ['always', 'seldom'])
