@@ -20,14 +20,18 @@ Theory of operation
 
 from __future__ import annotations
 
+import _thread
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 import ctypes
 from functools import cache
 import hashlib
 from importlib.util import find_spec
 import os
 from pathlib import Path
-from types import FunctionType, ModuleType
+import signal
+import threading
+from types import FrameType, FunctionType, ModuleType
 from typing import Any
 
 from mddag_executor import progress
@@ -146,8 +150,33 @@ def prepare() -> None:
     """Compile the core, or load it from disk, with a call that runs nothing."""
     if not _is_compiled():
         progress.report(f'compiling the core, once: about {_COMPILE_S:.0f} s')
-    run_each(Tables.build(None), Load([], [], [], [], [], []), 'rad',
-             Orders(*[0] * len(Orders._fields)))
+    with _interruptible():
+        run_each(Tables.build(None), Load([], [], [], [], [], []), 'rad',
+                 Orders(*[0] * len(Orders._fields)))
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Repeat a Ctrl-C that comes where LLVM calls Python, which would lose the exception."""
+    before = signal.getsignal(signal.SIGINT)
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        at = frame
+        while at is not None and not at.f_code.co_name.startswith('_raw_object_cache_'):
+            at = at.f_back
+        if at is None:
+            before(number, frame)
+        else:
+            threading.Timer(0.01, _thread.interrupt_main).start()
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def run_each(

@@ -158,7 +158,7 @@ def test_every_release_reaches_every_sink(task_set, ros_context, monkeypatch):
             assert ran - 8 <= len(releases) == len(ledger.completions[name]) <= ran
             # Each sink knows the release of its job exactly: they are on the nominal grid.
             if dag.vertices[dag.source].callback.kind == 'timer':
-                for release in releases:
+                for release in sorted(releases)[1:]:    # the first one if it was found in time
                     late = (release - ledger.first_release[dag.name] + 5 * MS) % dag.period_ns
                     assert 0 < late < 10 * MS  # the system clock is adjusted meanwhile
     assert result['attribution'] == {'wrong': 0, 'none': 0}
