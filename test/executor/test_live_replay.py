@@ -12,6 +12,7 @@ from mddag_executor import open_recording
 from mddag_executor.core.tally import total
 from mddag_executor.executor import current_job
 from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay.drafting import System
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
@@ -109,6 +110,9 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
     for key, use in result['callbacks'].items():
         assert use['executions'] == live['callbacks'][key]['ran'], key
         assert use['busy_ns'] == live['callbacks'][key]['busy_ns'], key
+    # also for `graph from-trace`: a coroutine is one execution, however often it is resumed
+    drafted = {f'{each.node}:{each.name}': each.runs for each in System(path).draft().callbacks()}
+    assert drafted['/right:rectify'] == live['callbacks']['/right:rectify']['ran']
     assert 10 < result['undeclared']['executions'] <= live['undeclared']
     assert sum(result['dropped'].values()) >= sum(live['dropped'].values())
     reported = sorted((miss.vertex, miss.job) for miss in misses)
