@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 import os
 import re
 import sys
@@ -51,13 +52,17 @@ def _init(context: Context | None, arguments: list[str]) -> None:
     What native code writes to standard error is shown only when there is no exception: else it is
     the same once more.
     """
+    init = partial(rclpy.init, args=arguments, context=context,
+                   signal_handler_options=SignalHandlerOptions.NO)
+    if sys.stderr is None:  # it was closed when the process started
+        init()
+        return
     sys.stderr.flush()
     with tempfile.TemporaryFile() as kept:
         stderr = os.dup(2)
         os.dup2(kept.fileno(), 2)
         try:
-            rclpy.init(
-                args=arguments, context=context, signal_handler_options=SignalHandlerOptions.NO)
+            init()
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)

@@ -96,6 +96,11 @@ def test_ros_arguments(bag, graph):
     assert len(seen) == 21
 
 
+def test_a_process_without_standard_error_may_rerun(bag, graph, monkeypatch):
+    monkeypatch.setattr(sys, 'stderr', None)
+    assert run_filter(bag, graph)[1].callbacks == 20
+
+
 def test_timeouts_of_python_and_rclpy_take_virtual_time(bag, graph):
     def take(node, number):
         if number == 2:
