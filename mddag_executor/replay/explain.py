@@ -24,6 +24,7 @@ from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.tables import (
     different,
+    in_parts,
     Ints,
     Recording,
     rows,
@@ -193,13 +194,19 @@ class Explanation:
     def _stops(self) -> list[tuple[int, int]]:
         """Return the stops of the machine, each from the last event before it."""
         recording, table = self._recording, self._recording.executions
-        times = [*(table[name] for name in ('ready', 'start', 'end')),
-                 recording.releases['noticed'], recording.publications['time']]
-        found = []
-        for begin, end in zip(*(recording.stops[name].tolist() for name in ('start', 'end'))):
-            if end - begin >= LEAST_NS:
-                last = max(int(each[each <= begin].max(initial=-_NO_END)) for each in times)
-                found.append((last if last >= max(0, begin - LEAST_NS) else begin, end))
+        stops = recording.stops[recording.stops['end'] - recording.stops['start'] >= LEAST_NS]
+        if not len(stops):
+            return []
+        begins = np.sort(stops['start'])
+        # by begin the last event up to it, and by the end of all the later ones
+        last = np.full(len(begins) + 1, -_NO_END)
+        for times in (*(table[name] for name in ('ready', 'start', 'end')),
+                      recording.releases['noticed'], recording.publications['time']):
+            for part in in_parts(times):
+                np.maximum.at(last, np.searchsorted(begins, part), part)
+        last = np.maximum.accumulate(last)[np.searchsorted(begins, stops['start'])]
+        near = last >= np.maximum(0, stops['start'] - LEAST_NS)
+        found = zip(np.where(near, last, stops['start']).tolist(), stops['end'].tolist())
         return sorted(found)
 
     @cached_property

@@ -245,6 +245,10 @@ def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path, call):
     assert len(open_recording(path).stops) == 3    # without the empty one
     result = explained(path)
     assert result['causes']['machine'] == result['missed'] == 9
+    # each from the last event before it, if that is near
+    stalls = [(stall['at_ns'] - ns(0), stall['length_ns']) for stall in result['stalls']]
+    assert stalls == [(each[0] * MS, each[1] * MS) for each in (
+        (3000, 35), (3040, 30), (5040, 30))]
     assert sum(stall['misses'] for stall in result['stalls']) == 2
     for verb in ('explain', 'replay'):
         assert '9 misses: 9 machine\n' in call(verb, path).stdout
