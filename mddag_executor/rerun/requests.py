@@ -101,7 +101,7 @@ class Requests:
     def _wait_for_service(self, client: Client, timeout_sec: float | None = None) -> bool:
         name = service_name(client)
         self._loop.wait(lambda: self._service(name) is not None or not alive(client),
-                        timeout_sec, f'for service {name}', lends=True)
+                        timeout_sec, f'for service {name}')
         return client.service_is_ready()
 
     def call_async(self, client: Any, request: Any) -> Future:
@@ -185,7 +185,7 @@ class Requests:
     def _wait_for_server(self, client: Any, timeout_sec: float | None = None) -> bool:
         handle = action_handle(client)
         return self._loop.wait(lambda: bool(self._peers(handle)), timeout_sec,
-                               f'for action {self._actions[id(handle)][0]}', lends=True)
+                               f'for action {self._actions[id(handle)][0]}')
 
     def _ask_action(self, kind: str, handle: Any, request: Any) -> int:
         number = next(self._numbers)

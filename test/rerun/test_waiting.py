@@ -308,7 +308,7 @@ def test_warnings(bag, graph):
             node.get_clock().sleep_for(Duration(seconds=1))
             raise ValueError('woken too early')
 
-    _, result = run_filter(bag, graph, take, workers=1)
+    _, result = run_filter(bag, graph, take, workers=3)
     names, reads, sleeps, asked, service, action, raised = result.warnings
     assert names.startswith('/filter: get_node_names asks the middleware')
     assert [warning.partition(': ')[2] for warning in (reads, sleeps)] == [
