@@ -150,7 +150,7 @@ def test_every_release_reaches_every_sink(task_set, ros_context, monkeypatch):
     for dag in task_set.dags:
         for name, sink in result['dags'][dag.name]['sinks'].items():
             assert abs(sink['due'] - result['window_ns'] / dag.period_ns) <= 1, name
-            assert sink['response_ns']['min'] >= 0
+            assert sink['response_ns']['min'] > -1 * MS     # see _EARLY_NS
             # A busy machine may skip releases and make jobs late, but what began is not lost;
             # some are open at the end.
             ran = len(ledger.durations[dag.vertices[dag.source].name])
@@ -158,7 +158,7 @@ def test_every_release_reaches_every_sink(task_set, ros_context, monkeypatch):
             assert ran - 8 <= len(releases) == len(ledger.completions[name]) <= ran
             # Each sink knows the release of its job exactly: they are on the nominal grid.
             if dag.vertices[dag.source].callback.kind == 'timer':
-                for release in sorted(releases)[1:]:    # the first one if it was found in time
+                for release in sorted(releases)[1:]:    # the first one if the timer was known
                     late = (release - ledger.first_release[dag.name] + 5 * MS) % dag.period_ns
                     assert 0 < late < 10 * MS  # the system clock is adjusted meanwhile
     assert result['attribution'] == {'wrong': 0, 'none': 0}
