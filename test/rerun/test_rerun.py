@@ -7,7 +7,6 @@ import gc
 import os
 import random
 import threading
-import time
 import uuid
 
 from builtin_interfaces.msg import Time
@@ -36,6 +35,7 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Header, String
 import yaml
 
+from ..executor.conftest import wait_for
 from .helpers import GRAPH, MS, run_filter, START, write_bag
 
 GAIN = 2.0
@@ -80,10 +80,8 @@ def test_the_middleware_is_left(bag, graph):
     gc.disable()
     try:
         rerun(bag, graph, [Filter, Sink])
-        until = time.monotonic() + 10
-        while len(os.listdir('/proc/self/task')) > before and time.monotonic() < until:
-            time.sleep(0.01)    # a thread that has ended is there for a moment
-        assert len(os.listdir('/proc/self/task')) <= before
+        # a thread that has ended is there for a moment
+        assert wait_for(lambda: len(os.listdir('/proc/self/task')) <= before)
     finally:
         gc.enable()
 
