@@ -146,6 +146,7 @@ class GuestExecutor:
 
     def add_node(self, node: Node) -> bool:
         """Add a node; once this executor has spun, it runs at once."""
+        node = self.host.itself(node)
         if self.guest is None and self.is_global and isinstance(node.executor, GuestExecutor):
             return False  # rclpy.spin_once in a callback: the node stays with its program
         added: bool = Executor.add_node(self, node)  # type: ignore[arg-type]
@@ -155,6 +156,7 @@ class GuestExecutor:
 
     def remove_node(self, node: Node) -> None:
         """Remove a node."""
+        node = self.host.itself(node)
         Executor.remove_node(self, node)  # type: ignore[arg-type]
         if self.has_spun and not self.is_global:
             self.host.release(node, self.guest)

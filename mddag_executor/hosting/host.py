@@ -105,6 +105,8 @@ class Host:
         self._lock = threading.RLock()  # reentrant: a signal handler may interrupt its owner
         self._node_of: Any = weakref.WeakKeyDictionary()  # by entity
         self._executors: Any = weakref.WeakSet()
+        # the node behind each object that a program has added as a node
+        self._behind: Any = weakref.WeakKeyDictionary()
         self._signals = GuestSignals(self)
         self._replacements = Replacements()
 
@@ -231,7 +233,10 @@ class Host:
         guest.ended = True
         if not self._ended:
             for node in list(guest.nodes):
-                self.executor.remove_node(node)
+                try:
+                    self.executor.remove_node(node)
+                except Exception as error:  # the program's own code, which must not keep the run
+                    guest.error = guest.error or error
             self._end_run_after_last()
         self.wake()
         if guest.error is not None:
@@ -286,6 +291,14 @@ class Host:
                 self.executor.add_node(node)
         if guest is not None and node not in guest.nodes:
             guest.nodes.append(node)
+
+    def itself(self, node: Any) -> Any:
+        """Return the node behind an object that only passes on to one, as those of ros2cli do."""
+        if isinstance(node, Node):
+            return node
+        if node not in self._behind:  # later it may refuse to pass on
+            self._behind[node] = getattr(node.get_name, '__self__', node)
+        return self._behind[node]
 
     def release(self, node: Node, guest: Guest | None) -> None:
         """Remove a program's node from the executor."""

@@ -127,6 +127,15 @@ def test_a_run_ends_with_its_last_program(world, mddag):
     assert 'typed w' in done.stdout.splitlines()
 
 
+def test_what_a_node_raises_while_it_is_removed_ends_the_run(world, mddag):
+    """An object that passes on to a node counts as that node, as for rclpy."""
+    done = mddag('run', '--node', 'chat:refuses')
+    assert done.returncode == 70 and 'OSError: the device is gone' in done.stderr
+    done = mddag('run', '--node', 'chat:passes_on')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'passed on' in done.stdout and '/behind: ' in done.stdout
+
+
 @pytest.mark.parametrize(('names', 'lines'), [
     (['no_longer_spins'], ['results due']),     # no spin waits for what its callback raises
     (['raises_in_a_callback', 'shuts_down_in_a_callback'], [

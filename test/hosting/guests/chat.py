@@ -182,6 +182,29 @@ def spins_in_callbacks():
     rclpy.spin(node)
 
 
+class PassesOn:
+    """What ros2cli makes: no node, passes on to one, and refuses after the shutdown."""
+
+    def __init__(self):
+        self.node = Node('behind')
+
+    def __getattr__(self, name):
+        if not rclpy.ok():
+            raise RuntimeError('shut down')
+        return getattr(self.node, name)
+
+
+def passes_on():
+    rclpy.init()
+    proxy, future = PassesOn(), rclpy.Future()
+    proxy.create_timer(0.1, lambda: future.done() or future.set_result(1))
+    rclpy.spin_once(proxy.node, timeout_sec=0.05)
+    rclpy.spin_until_future_complete(proxy, future)
+    proxy.node.destroy_node()
+    rclpy.try_shutdown()
+    print('passed on')
+
+
 # --- how a run ends ------------------------------------------------------------------------------
 
 
@@ -238,6 +261,25 @@ def blocks_in_a_callback():
 
 def raises_in_a_callback():
     after_a_while(lambda: 1 / 0, 0.5)  # when the next program has begun
+
+
+class Refuses(Node):
+    """Raises when another node is removed after the end."""
+
+    @property
+    def timers(self):
+        if not rclpy.ok():
+            raise OSError('the device is gone')
+        return super().timers
+
+
+def refuses():
+    rclpy.init()
+    executor = SingleThreadedExecutor()
+    for name in ('one', 'other'):
+        executor.add_node(Refuses(name))
+    executor.spin_once(timeout_sec=0.1)
+    rclpy.shutdown()
 
 
 def no_longer_spins():
