@@ -55,7 +55,7 @@ from mddag_executor.executor.shutdown import (
 )
 from mddag_executor.executor.statistics import statistics
 from mddag_executor.executor.statistics_types import Statistics
-from mddag_executor.executor.tasks import make_task, Unclaimed
+from mddag_executor.executor.tasks import make_task, Unclaimed, watched
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.waitables import WaitSetThread
@@ -353,6 +353,8 @@ class MultiDeadlineExecutor(BareExecutor):
         The callback that completes the future has ended on return, unless it takes much longer.
 
         :param timeout_sec: seconds; None or negative: for ever; 0: run one callback at most.
+        :raises Exception: the exception of a callback, or of the future if it is a task that has
+            failed and no other code handles that.
         """
         if timeout_sec == 0:
             with suppress(ExternalShutdownException):
@@ -374,11 +376,8 @@ class MultiDeadlineExecutor(BareExecutor):
             self._settle(completed_by, handled)
             return True
 
-        future.add_done_callback(QuickCallback(note))
-        try:
+        with watched(future, note), suppress(ExternalShutdownException):
             self._spin(is_done, timeout_sec)
-        except ExternalShutdownException:
-            pass
 
     def _spin(self, done: Callable[[], bool], timeout_sec: float | None) -> None:
         deadline = deadline_of(timeout_sec)
@@ -544,8 +543,8 @@ class MultiDeadlineExecutor(BareExecutor):
     ) -> None:
         """Wait for one callback, or until a future is done, and run it."""
         seconds = timeout_sec.timeout if isinstance(timeout_sec, TimeoutObject) else timeout_sec
-        future.add_done_callback(QuickCallback(self.wake))
-        self._spin_once(seconds, lambda: future.done() or future.cancelled())
+        with watched(future, self._at_once.ring):
+            self._spin_once(seconds, lambda: future.done() or future.cancelled())
 
     def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
         deadline = deadline_of(timeout_sec)

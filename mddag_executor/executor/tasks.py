@@ -6,7 +6,8 @@ Tasks of the executor: futures that know whether their exception is handled.
 Theory of operation
 -------------------
 The exception of a task comes out of the spin, as with rclpy's executors, unless it is handled: the
-task was awaited, or got a done callback, before it failed (it is *observed*).
+task was awaited, or got a done callback, before it failed (it is *observed*).  A spin that waits
+for a task (``spin_until_future_complete``) is no observer: it raises the task's exception itself.
 
 With several workers a task may fail before the callback that created it reaches its ``await`` or
 ``result()``.  So the exception of such a task is deferred while that callback runs and a reference
@@ -16,7 +17,8 @@ to the task exists.  If the exception is fetched meanwhile, it is handled.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 import inspect
 from typing import Any
@@ -37,6 +39,7 @@ class ObservedTask(BareTask):
 
     :ivar maker: the execution whose callback has created it, or None.
     :ivar deferred_to: receives a deferred exception that was not handled.
+    :ivar spins: how many spins wait for its end.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -44,6 +47,8 @@ class ObservedTask(BareTask):
         running = current.running
         self.maker: Work | None = None if running is None else running.work
         self.deferred_to: Callable[[BaseException], None] | None = None
+        self.spins = 0
+        self._claims = [None]
         super().__init__(*args, **kwargs)
 
     def __del__(self) -> None:
@@ -56,12 +61,26 @@ class ObservedTask(BareTask):
         """Return the exception if it is not handled."""
         return None if self.observed else self.unfetched()
 
+    def claim(self) -> BaseException | None:
+        """Return the exception if it is not handled, to one caller only, which raises it."""
+        error = self.unclaimed()
+        try:
+            if error is not None:
+                self._claims.pop()  # one thread succeeds
+        except IndexError:
+            return None
+        self.mark_fetched()
+        return error
+
+    def is_expected(self) -> bool:
+        """Return whether its maker still runs, or a spin waits for it: they may handle it."""
+        return self.spins > 0 or self.maker is not None and self.maker.x >= 0
+
     def report(self) -> None:
         """Report a deferred exception, unless it has been handled."""
         report, self.deferred_to = self.deferred_to, None
-        error = self.unclaimed()
+        error = None if report is None else self.claim()
         if error is not None and report is not None:
-            self.mark_fetched()
             report(error)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
@@ -92,9 +111,11 @@ class Unclaimed:
         if error is None:
             task.maker = None
             return
-        if task.maker is None or task.maker.x < 0:
-            task.mark_fetched()
-            raise error
+        if not task.is_expected():
+            error = task.claim()
+            if error is not None:
+                raise error
+            return
         forget_task_frames(error)  # else the task refers to itself
         task.deferred_to = self._fail
         self._tasks.append(weakref.ref(task))
@@ -111,10 +132,34 @@ class Unclaimed:
             task = reference()
             if task is None or task.unclaimed() is None:
                 continue
-            if task.maker is None or task.maker.x < 0:
-                task.report()
-            else:
+            if task.is_expected():
                 self._tasks.append(reference)
+            else:
+                task.report()
+
+
+@contextmanager
+def watched(future: Future, notify: Callable[[], object]) -> Iterator[None]:
+    """
+    Call a function when a future is done while entered, for a spin that waits for it.
+
+    If the future is a task that has failed, its exception is raised at the end, unless it is
+    handled.
+    """
+    callback = QuickCallback(notify)
+    task = future if isinstance(future, ObservedTask) else None
+    if task is not None:
+        task.spins += 1
+    Future.add_done_callback(future, callback)  # not an observer
+    try:
+        yield
+    finally:
+        future.remove_done_callback(callback)
+        if task is not None:
+            task.spins -= 1
+    error = None if task is None else task.claim()
+    if error is not None:
+        raise error
 
 
 def make_task(

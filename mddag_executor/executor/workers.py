@@ -679,7 +679,9 @@ class WorkerPool:
                 engine.destroyed(work, now)
             else:
                 engine.finished(work, start, end, now, me.vtid, worker, True)
-            if not is_gone:
+            if not is_gone and self.callback_ended is None:
+                self.fail(outcome)  # at once: the spin may be about to end
+            elif not is_gone:
                 self.deferred.append(partial(self._report_error, work, outcome))
         engine.ask_again()
 

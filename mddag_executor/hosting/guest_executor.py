@@ -18,6 +18,7 @@ import threading
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor.compat import is_called_by_spin
+from mddag_executor.executor.tasks import watched
 from rclpy.executors import Executor
 from rclpy.node import Node
 
@@ -71,16 +72,14 @@ class GuestExecutor:
 
     def spin_until_future_complete(self, future: Any, timeout_sec: Any = None) -> None:
         """Let the nodes run, and wait for a future."""
-        self._wait(self._is_done(future), timeout_sec)
+        with watched(future, self.wake_waiting):
+            self._wait(_is_done(future), timeout_sec)
         self._turns = 0
 
     def spin_once_until_future_complete(self, future: Any, timeout_sec: Any = None) -> None:
         """Do the same as ``spin_once``, or wait until a future is done."""
-        self._step(self._is_done(future), timeout_sec)
-
-    def _is_done(self, future: Any) -> Callable[[], bool]:
-        future.add_done_callback(lambda _: self.wake_waiting())
-        return lambda: bool(future.done() or future.cancelled())
+        with watched(future, self.wake_waiting):
+            self._step(_is_done(future), timeout_sec)
 
     def _step(self, until: Callable[[], bool], timeout_sec: Any) -> None:
         if self.guest is None and self.is_global:  # for rclpy.spin_once in a callback
@@ -177,6 +176,10 @@ class GuestExecutor:
         for node in Executor.get_nodes(self):  # type: ignore[arg-type]
             self.remove_node(node)
         return bool(Executor.shutdown(self, timeout_sec))  # type: ignore[arg-type]
+
+
+def _is_done(future: Any) -> Callable[[], bool]:
+    return lambda: bool(future.done() or future.cancelled())
 
 
 def make_guest(executor: Any, host: Host, guest: Guest | None) -> None:

@@ -230,6 +230,46 @@ def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor):
 
 
 @pytest.mark.usefixtures('each_rclpy')
+@pytest.mark.parametrize('steps', [False, True])
+def test_a_spin_that_waits_for_a_task_raises_its_exception(make_executor, steps):
+    """Once, also if the maker of the task still runs; a later spin is not disturbed by it."""
+    executor = make_executor()
+    goes_on, made = Future(executor=executor), []
+
+    def spin(future):
+        if not steps:
+            executor.spin_until_future_complete(future, 5.0)
+        while steps and not future.done():
+            executor.spin_once_until_future_complete(future, 5.0)
+
+    async def fails_when_it_goes_on():
+        await goes_on
+        fails()
+
+    async def make():
+        made.append(executor.create_task(fails))
+        await goes_on
+
+    for kind in (fails, fails_later):
+        with pytest.raises(KeyError, match='handled'):
+            spin(executor.create_task(kind))
+    maker = executor.create_task(make)
+    executor.spin_once(0.0)
+    with pytest.raises(KeyError, match='handled'):
+        spin(made[0])
+    task = executor.create_task(fails_when_it_goes_on)
+    for _ in range(3):  # without the task's end, a spin leaves nothing behind
+        executor.spin_until_future_complete(task, 0.001)
+        executor.spin_once_until_future_complete(task, 0.001)
+    assert len(goes_on._callbacks) == 2 and len(task._callbacks) == 1  # the coroutines' own
+    executor.create_task(goes_on.set_result, None)
+    with pytest.raises(KeyError, match='handled'):
+        spin(task)
+    assert maker.done()
+    spin(executor.create_task(lambda: time.sleep(0.06)))  # exceptions are checked in that time
+
+
+@pytest.mark.usefixtures('each_rclpy')
 def test_coroutines_ask_and_answer(make_executor, make_node):
     node, answers = make_node(), []
 

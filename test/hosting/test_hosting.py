@@ -138,6 +138,7 @@ def test_what_a_node_raises_while_it_is_removed_ends_the_run(world, mddag):
 
 @pytest.mark.parametrize(('names', 'lines'), [
     (['no_longer_spins'], ['results due']),     # no spin waits for what its callback raises
+    (['waits_for_a_task'], ['Traceback', '--node chat:waits_for_a_task: ']),
     (['raises_in_a_callback', 'shuts_down_in_a_callback'], [
         '--node chat:raises_in_a_callback: its main has raised ZeroDivisionError',
         'its nodes run no more', 'shut down', 'results due'])])

@@ -289,6 +289,13 @@ def no_longer_spins():
         time.sleep(60)
 
 
+def waits_for_a_task():
+    rclpy.init()
+    executor = SingleThreadedExecutor()
+    executor.add_node(Node('waiting'))
+    executor.spin_until_future_complete(executor.create_task(lambda: 1 / 0))
+
+
 # --- what cannot start ---------------------------------------------------------------------------
 
 
