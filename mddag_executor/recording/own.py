@@ -244,10 +244,12 @@ class _Source:
             published = pick(published, sort_by(time))
             time = published['timestamp']
         by = running_at(executions, completed, published['vtid'], time, published['place'])
-        return rows(
+        table = rows(
             PUBLICATIONS, len(published), publisher=published['publisher_handle'],
-            execution=by, time=time, source_timestamp=UNKNOWN,
-            vertex=np.where(by >= 0, executions['vertex'][by], UNKNOWN))
+            execution=by, vertex=UNKNOWN, time=time, source_timestamp=UNKNOWN)
+        known = by >= 0     # a killed run may have publications, and no execution
+        table['vertex'][known] = executions['vertex'][by[known]]
+        return table
 
     def _releases(self, released: Table) -> tuple[Table, Ints]:
         """Return the releases, and their positions in the file."""

@@ -305,7 +305,11 @@ class JobNumbers:
 
     def of(self, table: Table) -> Ints:
         """Return the job numbers of rows."""
-        dag, at = table['dag'].astype(np.int64), look_up(self._numbers, table['job'])
+        return self.of_jobs(table['dag'], table['job'])
+
+    def of_jobs(self, dag: Any, job: Any) -> Ints:
+        """Return the job numbers of DAGs and jobs."""
+        dag, at = dag.astype(np.int64), look_up(self._numbers, job)
         known = (dag >= 0) & (dag < self._dags) & (at >= 0)
         return np.where(known, dag * len(self._numbers) + at, self.none)
 

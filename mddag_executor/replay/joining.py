@@ -15,8 +15,9 @@ Each trace becomes a recording; their tables are merged in the order of time.
    48 bits.  Workers are numbered consecutively.  A process or thread id that another trace uses,
    too (containers, other machines), is replaced by an unused one.
 3. *Jobs* are renumbered in the order of their first release.  Releases of two processes belong to
-   the same job if they are equal within ``SAME_RELEASE``.  If header stamps join the jobs of a
-   DAG, a release also belongs to the job that was released up to one period of the DAG earlier:
+   the same job if they are equal within ``SAME_RELEASE``: releases of a burst are closer, so the
+   nearest one counts, of equally near ones the oldest.  If header stamps join the jobs of a DAG,
+   a release also belongs to the job that was released up to one period of the DAG earlier:
    the stamp is later than the timer was due.  Any other release is a new job.  A stamp is a time
    of the source machine's clock, no matter which machine recorded it.
 4. If several processes run a DAG, the vertices of all of them are expected.  Jobs are judged as
@@ -178,11 +179,11 @@ class _Part:
             and 0 < value < 1 << _BITS else value
             for value, (field, kind) in zip(event[4:], kinds)))
 
-    def renumber(self, legs: Ints) -> RowNumbers:
+    def renumber(self, legs: Ints, dag_of: Ints) -> RowNumbers:
         """
         Renumber the jobs in all tables; drop rows of unknown jobs.
 
-        :param legs: by vertex the number of its legs.
+        :param legs: by vertex the number of its legs; ``dag_of``: its DAG, at the end -1.
         :return: the new numbers of executions.
         """
         found = self.recording
@@ -208,6 +209,9 @@ class _Part:
             row = rows[jobs.of(table)]
             table['job'] = self.number[row] if len(self.number) else UNKNOWN
             setattr(found, name, pick(table, row >= 0))
+        drops = found.drops     # those of unknown jobs are still counted
+        row = rows[jobs.of_jobs(dag_of[drops['vertex']], drops['job'])]
+        drops['job'] = np.append(self.number, UNKNOWN)[row]
         new = RowNumbers(kept)
         found.executions = pick(found.executions, kept)
         found.releases['job'] = self.number
@@ -254,8 +258,10 @@ class Joined:
         self._releases: list[deque[tuple[int, int, set[int]]]] = [
             deque(maxlen=_KEPT) for _ in self.task_set.dags]
         self._next = [0] * len(self.task_set.dags)
-        #: By vertex the number of its legs, and by DAG its vertices.
+        #: By vertex the number of its legs and its DAG, and by DAG its vertices.
         self._legs = Numbering(self.task_set).n_legs
+        self._dag_of = np.array([
+            *(dag.index for dag in self.task_set.dags for _ in dag.vertices), UNKNOWN])
         first_of = np.cumsum([0, *(len(dag.vertices) for dag in self.task_set.dags)]).tolist()
         self._vertices = [range(*each) for each in zip(first_of, first_of[1:])]
         self._hosted: list[tuple[int, int, int, frozenset[int]]] = []
@@ -313,7 +319,7 @@ class Joined:
             part.read(who, threads, self._workers, count, progress)
             count += part.reader.message_count or 0
         self._number_jobs()
-        rows = [part.renumber(self._legs) for part in self._parts]
+        rows = [part.renumber(self._legs, self._dag_of) for part in self._parts]
         self._check_run()
         head = self.head._replace(
             time=min(part.first for part in self._parts), workers=self._workers)
@@ -456,18 +462,19 @@ class Joined:
     def _find(self, dag: Dag, release: int, place: int) -> tuple[int, int, set[int]] | None:
         """Return the job of a release that another process has released (rule 3)."""
         stamped = dag.release_from == 'header_stamp'
-        best = None
+        nearest = earlier = None
+        least = SAME_RELEASE
         for known in reversed(self._releases[dag.index]):
             away = release - known[0]
             if away > max(dag.period_ns, SAME_RELEASE):
                 break
             if place in known[2]:
                 continue
-            if abs(away) <= SAME_RELEASE:
-                return known
-            if stamped and best is None and 0 < away < dag.period_ns:
-                best = known
-        return best
+            if abs(away) <= least:
+                nearest, least = known, abs(away)
+            elif stamped and earlier is None and 0 < away < dag.period_ns:
+                earlier = known
+        return earlier if nearest is None else nearest
 
     def _check_run(self) -> None:
         """Refuse traces of several runs (rule 6)."""

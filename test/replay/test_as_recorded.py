@@ -239,6 +239,16 @@ def test_a_killed_run_is_judged_at_its_last_instant(trace):
             for sink in dag['sinks'].values()] == [1, 1, 1]
 
 
+def test_a_run_killed_in_its_first_callback_which_had_published(trace):
+    trace.add('rcl_publisher_init', 0, 100, 1, 100, '/image', 10)
+    trace.release(0, 0, 10)
+    trace.add('rclcpp_publish', 11, 100, 7, 0, thread=10)
+    trace.file.finish()
+    outcome = replay(trace.path)
+    assert outcome.recording.publications[['execution', 'vertex']].tolist() == [(-1, -1)]
+    assert outcome.result()['dags']['/camera']['jobs'] == 1
+
+
 def test_misses_that_are_not_those_recorded_are_said(trace):
     job_of_the_camera(trace, 0, 10)
     trace.add('deadline', 26, 0, 4, 0, START_TIME + 24 * MS, START_TIME + 25 * MS)

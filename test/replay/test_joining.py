@@ -5,6 +5,7 @@
 import json
 
 from mddag_executor.core import NEVER
+from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.clocks import offsets
@@ -111,6 +112,45 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late, boot):
     assert result['workers'] == 4 and set(result['callbacks']) == {'/a:tick', '/b:take'}
     assert outcome.recording.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
     assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
+
+
+@pytest.mark.parametrize('apart', [20_000, 0])
+def test_the_messages_of_a_burst_keep_their_jobs(tmp_path, apart):
+    up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
+    for i in range(3):
+        release = MS + i * apart
+        up.runs(release, (1 + i) * MS + 100_000, ready=release)
+        down.runs(release + 5, (3 + 3 * i) * MS, 3 * MS, ready=(3 + i) * MS)
+    found = replay([up.end(90 * MS), down.end(90 * MS)]).judged.verdicts
+    assert found['job'].tolist() == [0, 1, 2]
+    assert (found['completed'] - found['release']).tolist() == [
+        5 * MS, 8 * MS - apart, 11 * MS - 2 * apart]
+
+
+@pytest.mark.parametrize(('key', 'reason', 'verdict'), [
+    ('keep: newest', 'newer', SINK_DROPPED), ('on_late: abort', 'aborted', SINK_ABORTED)])
+def test_drops_are_of_the_jobs_of_the_run(tmp_path, key, reason, verdict):
+    """The second process starts later, so that its job 1 is job 4 of the run."""
+    whose = 'timer: 10ms' if reason == 'aborted' else 'subscription: /x'
+    graph = GRAPH.replace(whose, f'{whose}, {key}')
+    up = Trace(tmp_path, 'up', 0, graph=graph)
+    down = Trace(tmp_path, 'down', 1, graph=graph, begin=30 * MS, judges_from=30 * MS)
+    for i in range(6):
+        at = i * 10 * MS
+        up.runs(at, at)
+        if i == 4:
+            down.add('job_release', at + 2 * MS, 0, 1, BASE + at)
+            down.add('drop', at + 12 * MS, ADDRESS, 0, 1, 1, reason)
+            if reason == 'aborted':
+                down.add('abort', at + 12 * MS, 0, 1)
+            down.job = 2
+        elif i > 2:
+            down.runs(at, at + 2 * MS)
+    outcome = replay([up.end(90 * MS), down.end(90 * MS)])
+    missed, = outcome.judged.missed
+    assert (missed['job'], missed['kind']) == (4, verdict)
+    if reason == 'aborted':
+        assert outcome.explanation.worst()['parts'][-1]['cause'] == 'waited'
 
 
 def two_machines(folder, late, back=True):
