@@ -9,21 +9,27 @@ Theory of operation:
    because the bindings usually belong to the system's Python and abort on some damage. Python
    interpreters are tried one after the other, the running one first, until one has the bindings.
 2. All traces of a session (processes, kernel, rotated chunks) are read as one stream in the order
-   of time.  A folder with several sessions is refused, because they may be of different runs.
-   Sessions of one run on several computers are given one by one, and written one after the other;
-   readers sort events by time.  CARET's cache `caret_converted` in the session's folder is a
-   Python pickle of the same events. It is not read, because unpickling can run any code.
+   of time, and so are several sessions of one host: the metadata has its name, and the UUID of its
+   clock, which is that of its boot.  The sessions of several hosts are written one after the
+   other; readers sort events by time.  A folder with several sessions is refused, because they may
+   be of different runs, unless they are the two of `ros2 trace --dual-session`: `snapshot`, which
+   has the events of the initialisation, and `runtime`.  CARET's cache `caret_converted` in the
+   session's folder is a Python pickle of the same events. It is not read, because unpickling can
+   run any code.
 3. Every event becomes one event of the trace, with all fields of its payload. An event of the
    table (`schema.EVENTS`) has the table's types for the table's fields: integer flags become bool,
    unsigned times become int64 of the same bits. Other events and fields keep their types. A name
    that ROS does not allow is changed; a name that the preamble or the table uses otherwise gets
    `_` appended.
-4. The contexts `vpid` and `vtid` become the preamble.  If sessions of several computers or
-   containers have the same ids, those of later sessions are changed (`numbers`).  An event
-   `mddag:process` with `procname` precedes the first event of a thread, and each change of its
-   name.
+4. The contexts `vpid` and `vtid` become the preamble.  Events of one host and process id belong to
+   one process, in whichever session they are.  If several hosts have the same ids, those of later
+   hosts and containers are changed (`numbers`).  An event `mddag:process` with `procname` precedes
+   the first event of a thread, and each change of its name.
 5. Events discarded by the tracer become an event `mddag:lost` at the end of the gap; a lost packet
    counts as at least one event, and a warning reports it.
+6. A tracepoint writes to all sessions that record it before its thread goes on.  So an event that
+   equals the one before it in its thread, and that another session recorded, is the same event: it
+   is written once (`_Repeats`).
 """
 
 from __future__ import annotations
@@ -39,7 +45,7 @@ import signal
 import struct
 import subprocess
 import sys
-from typing import Any, IO
+from typing import Any, IO, NamedTuple
 
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
@@ -55,7 +61,11 @@ _CACHE = 'caret_converted'
 _RECORD = 'check the recording, or record it again'
 _UNREADABLE = 'check the recording (CTF 2 needs babeltrace2 2.1), or record it again'
 
+# When sessions take turns, one or two events of each thread may look strange.
+_STRANGE = 100
+
 Row = list[Any]
+_Thread = tuple[int, int, int]
 Converters = list[Callable[[Any], Any] | None]
 
 
@@ -72,6 +82,24 @@ class Imported:
     warnings: list[str] = field(default_factory=list)
 
 
+_Host = tuple[str, str]
+"""The name of a host, and the UUID of its clock; of a session without them its path."""
+
+
+class _Session(NamedTuple):
+    """
+    A session, or the two of `ros2 trace --dual-session`.
+
+    :ivar traces: the folders of its traces.
+    :ivar parts: how many sessions it is.
+    """
+
+    path: str
+    traces: list[str]
+    parts: int
+    host: _Host
+
+
 def import_ctf(
     session: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str], *, progress: Callable[[int], None] | None = None,
@@ -81,7 +109,7 @@ def import_ctf(
     Write the events of a CTF session into a trace file.
 
     :param session: the folder of the session, searched recursively for traces. Several sessions
-        are one run that was recorded on several computers.
+        are of one run, which one or several hosts recorded.
     :param output: the trace; after an exception what was there before is there
     :param progress: called regularly with the number of events
     :param overwrite: whether an existing file may be replaced
@@ -89,16 +117,31 @@ def import_ctf(
     """
     paths = [os.fspath(path) for path in (
         [session] if isinstance(session, (str, os.PathLike)) else session)]
-    found = [os.path.realpath(metadata) for path in paths for metadata in _metadata_of(path)]
+    sessions = [_session_in(path) for path in paths]
+    found = [os.path.realpath(trace) for each in sessions for trace in each.traces]
     name = ', '.join(paths)
     if len(set(found)) < len(found):
         raise TraceError(name, 'a session is named twice', 'name each once')
-    with whole_trace(os.fspath(output), overwrite) as part, TraceFile(
-            part, overwrite=True) as file:
+    hosts: dict[_Host, list[_Session]] = {}
+    for each in sessions:
+        hosts.setdefault(each.host, []).append(each)
+    try:
+        return _written(name, list(hosts.values()), os.fspath(output), progress, overwrite)
+    except _OtherHosts:
+        return _written(name, [[each] for each in sessions], os.fspath(output), progress,
+                        overwrite)
+
+
+def _written(
+    name: str, hosts: list[list[_Session]], output: str,
+    progress: Callable[[int], None] | None, overwrite: bool,
+) -> Imported:
+    """Write the sessions of some hosts into a trace."""
+    with whole_trace(output, overwrite) as part, TraceFile(part, overwrite=True) as file:
         importer = _Importer(name, file)
-        for path in paths:
-            importer.begin()
-            for row in _rows(path):
+        for sessions in hosts:
+            importer.begin(several=sum(each.parts for each in sessions) > 1)
+            for row in _rows([each.path for each in sessions]):
                 importer.take(row)
                 events = importer.result.events
                 if progress is not None and row[0] == 'event' and events % 5000 == 0:
@@ -109,13 +152,12 @@ def import_ctf(
     return importer.result
 
 
-def _metadata_of(path: str) -> list[str]:
+def _session_in(path: str) -> _Session:
     """
-    Return the metadata files of the traces of a session.
+    Return the session in a folder.
 
-    :param path: its folder.
-    :raises TraceError: if there is none, or of several sessions; babeltrace2's own message would
-        be unclear, and it hangs on cut metadata
+    :raises TraceError: if there is none, or several; babeltrace2's own message would be unclear,
+        and it hangs on cut metadata
     """
     remedy = 'name the folder that LTTng recorded to, such as ~/.ros/tracing/SESSION'
     if '\0' in path or not os.path.exists(path):
@@ -133,20 +175,22 @@ def _metadata_of(path: str) -> list[str]:
         parts = os.path.relpath(folder, path).split(os.sep)
         below = [place for place, part in enumerate(parts) if part in _PARTS]
         if below:
-            sessions.add(os.sep.join(parts[:below[0]]))
-    if len(sessions) > 1:
+            above = parts[:below[0]]
+            sessions.add(os.sep.join(above[:-1] if above and _SNAPSHOT.fullmatch(above[-1])
+                                     else above))
+    hosts = {_host_of(os.path.join(folder, 'metadata')) for folder in folders}
+    if len(sessions) > 1 and (sessions != _DUAL or len(hosts) > 1):
         raise TraceError(
             path, f'it holds {len(sessions)} sessions: {listed(sorted(sessions))}',
-            'name the folder of one, or, if they are of one run on several computers, each of '
-            'their folders')
-    found = [os.path.join(folder, 'metadata') for folder in folders]
-    for metadata in found:
-        _check_metadata(metadata)
-    return found
+            'name the folder of one, or, if they are of one run, each of their folders')
+    host = hosts.pop() if len(hosts) == 1 else None
+    return _Session(path, folders, max(1, len(sessions)), host or (os.path.realpath(path), ''))
 
 
-# The folders that LTTng makes in a session's folder.
+# The folders that LTTng makes in a session's folder; that of each snapshot is above them.
 _PARTS = {'ust', 'kernel', 'archives'}
+_SNAPSHOT = re.compile(r'.+-\d{8}-\d{6}-\d+')
+_DUAL = {'snapshot', 'runtime'}
 
 # The head of a metadata packet: magic, UUID, checksum, sizes of content and packet in bits, and
 # compression, encryption, checksum scheme, major, minor (CTF 1.8.3, 7.1).
@@ -154,8 +198,26 @@ _PACKET = '16sIII5B'
 _MAGIC = 0x75D11D57
 
 
-def _check_metadata(path: str) -> None:
-    """Check that the packets of metadata are whole; metadata may also be plain text."""
+# In the TSDL of CTF 1.8 and in the JSON of CTF 2.
+_HOSTNAME = re.compile(rb'\bhostname"?\s*[=:]\s*"([^"]*)"')
+_CLOCK_UUID = re.compile(rb'\bclock\s*\{[^}]*?\buuid\s*=\s*"([^"]*)"')
+
+
+def _host_of(path: str) -> _Host | None:
+    """Return the host that wrote metadata; None if the metadata does not say it."""
+    text = _text_of_metadata(path)
+    name, clock = _HOSTNAME.search(text), _CLOCK_UUID.search(text)
+    if name is None:
+        return None
+    return name[1].decode(errors='replace'), clock[1].decode(errors='replace') if clock else ''
+
+
+def _text_of_metadata(path: str) -> bytes:
+    """
+    Return the text of metadata without the heads of its packets; it may also be plain text.
+
+    :raises TraceError: if a packet is not whole.
+    """
     try:
         data = Path(path).read_bytes()
     except OSError as error:
@@ -163,16 +225,19 @@ def _check_metadata(path: str) -> None:
     if not data:
         raise TraceError(path, 'the metadata is empty', _RECORD)
     order = next((order for order in '<>' if data[:4] == struct.pack(f'{order}I', _MAGIC)), None)
-    position = 0 if order else len(data)
+    if order is None:
+        return data
+    head, text, position = struct.Struct(f'{order}I{_PACKET}'), b'', 0
     while position < len(data):
-        head = struct.Struct(f'{order}I{_PACKET}')
         packet = data[position:position + head.size].ljust(head.size, b'\0')
         magic, _, _, content, size, *_ = head.unpack(packet)
         if magic != _MAGIC or not head.size * 8 <= content <= size or (
                 position + size // 8 > len(data)):
             raise TraceError(
                 path, f'the metadata is cut or damaged at byte {position}', _RECORD)
+        text += data[position + head.size:position + content // 8]
         position += size // 8
+    return text
 
 
 # --- the helper process --------------------------------------------------------------------------
@@ -186,26 +251,28 @@ def interpreters() -> list[str]:
     return list(dict.fromkeys(name for name in found if name and os.access(name, os.X_OK)))
 
 
-def _rows(path: str) -> Iterator[Row]:
-    """Yield the rows from the first Python interpreter with bindings."""
+def _rows(paths: list[str]) -> Iterator[Row]:
+    """Yield the rows of the sessions of a host from the first Python interpreter with bindings."""
     for interpreter in interpreters():
-        rows = _rows_of(interpreter, path)
+        rows = _rows_of(interpreter, paths)
         first = next(rows, None)
         if first is not None and first[0] == 'ready':
             yield from rows
             return
         rows.close()
     raise TraceError(
-        path, "babeltrace2's Python bindings, which read it, are not installed", INSTALL)
+        ', '.join(paths), "babeltrace2's Python bindings, which read it, are not installed",
+        INSTALL)
 
 
-def _rows_of(interpreter: str, path: str) -> Generator[Row, None, None]:
+def _rows_of(interpreter: str, paths: list[str]) -> Generator[Row, None, None]:
+    path = ', '.join(paths)
     # PYTHONHOME of one interpreter breaks another. Without bytecode nothing is written.
     environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
     environment['PYTHONDONTWRITEBYTECODE'] = '1'
     try:
         process = subprocess.Popen(
-            [interpreter, str(_HELPER), os.path.abspath(path)], env=environment,
+            [interpreter, str(_HELPER), *map(os.path.abspath, paths)], env=environment,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     except OSError:
         return      # try the next interpreter
@@ -252,27 +319,87 @@ def _end_of(process: subprocess.Popen[bytes]) -> str:
 # --- from rows to events -------------------------------------------------------------------------
 
 
+class _OtherHosts(Exception):
+    """Sessions are not of one host, though their metadata says so."""
+
+
+class _Several:
+    """
+    Tells what several sessions of a host have in common (rule 6).
+
+    Containers may share the name and clock of a host, and number their processes for themselves.
+    If one thread has another name in another session, its process is another one.  If two sessions
+    record the same kinds of events of a thread, but not the same events, they are not of one host.
+    """
+
+    def __init__(self) -> None:
+        self.repeated = 0
+        self._strange = 0
+        self._last: dict[_Thread, tuple[str, list[Any], set[int]]] = {}     # and its traces
+        self._kinds: set[tuple[int, str]] = set()
+        self._named: dict[tuple[int, int], dict[str, int]] = {}
+        self._which: dict[tuple[int, int], int] = {}
+
+    def process(self, trace: int, vpid: int, vtid: int, procname: str | None) -> int:
+        """Return which of the processes with an id an event belongs to."""
+        names = self._named.setdefault((vpid, vtid), {})
+        which = self._which.get((trace, vpid))
+        if which is None:
+            which = names.get(procname or '', len(set(names.values())))
+            self._which[trace, vpid] = which
+        names.setdefault(procname or '', which)
+        return which
+
+    def is_repeat(self, thread: _Thread, trace: int, name: str, values: list[Any]) -> bool:
+        """
+        Return whether an event is the last one of its thread, recorded by another session.
+
+        :raises _OtherHosts: if the sessions contradict each other.
+        """
+        last = self._last.get(thread)
+        if last is not None and trace not in last[2] and last[0] == name and last[1] == values:
+            last[2].add(trace)
+            self.repeated += 1
+            return True
+        self._kinds.add((trace, name))
+        if last is not None and trace not in last[2] and any(
+                (other, name) in self._kinds for other in last[2]):
+            self._strange += 1
+            if self._strange > max(_STRANGE, self.repeated):
+                raise _OtherHosts
+        self._last[thread] = name, values, {trace}
+        return False
+
+
 class _Importer:
-    """Writes the rows of the sessions of a run as events."""
+    """Writes the rows of the sessions of a run as events, those of one host after another."""
 
     def __init__(self, path: str, file: TraceFile) -> None:
         self.result = Imported()
         self._path = path
         self._file = file
-        self._place = 0             # number of the session
+        self._place = 0             # number of the host
+        self._several: _Several | None = None       # if the host has several sessions
+        self._repeated = 0
         self._processes, self._threads = Numbers(), Numbers()
-        # by number of an event's class: its name, and the converters of its values
-        self._kinds: dict[int, tuple[str, Converters]] = {}
+        # by number of an event's class: its name, the converters of its values, and its trace
+        self._kinds: dict[int, tuple[str, Converters, int]] = {}
         self._names: set[str] = set()       # of events
         self._procnames: dict[tuple[int, int], str] = {}
         self._nameless = 0                          # events without process or thread
         self._uncounted = 0                         # gaps of an unknown number of events
         self._time = 0
 
-    def begin(self) -> None:
-        """Begin with the next session."""
+    def begin(self, several: bool) -> None:
+        """
+        Begin with the next host.
+
+        :param several: whether it has several sessions.
+        """
         self._place += 1
         self._kinds, self._time = {}, 0
+        self._repeated += self._several.repeated if self._several else 0
+        self._several = _Several() if several else None
 
     def take(self, row: Row) -> None:
         """Write a row."""
@@ -288,9 +415,15 @@ class _Importer:
         if vpid is None or vtid is None:
             self._nameless += 1
             vpid, vtid = vpid or 0, vtid or 0
-        name, converts = self._kinds[number]
-        vpid = self._processes.of(self._place, vpid)
-        vtid = self._threads.of(self._place, vtid)
+        name, converts, trace = self._kinds[number]
+        place = self._place, 0
+        if self._several is not None:
+            which = self._several.process(trace, vpid, vtid, procname)
+            if self._several.is_repeat((which, vpid, vtid), trace, name, values):
+                return
+            place = self._place, which
+        vpid = self._processes.of(place, vpid)
+        vtid = self._threads.of(place, vtid)
         if procname and self._procnames.get((vpid, vtid)) != procname:
             self._procnames[vpid, vtid] = procname
             self._file.extend((('mddag:process', time, vtid, procname),), vpid)
@@ -308,19 +441,26 @@ class _Importer:
         self.result.discarded += max(count, 1)
         self._file.extend((('mddag:lost', max(time, self._time), 0, max(count, 1)),), 0)
 
-    def _class(self, number: int, original: str, fields: list[tuple[str, str]]) -> None:
+    def _class(
+        self, number: int, original: str, fields: list[tuple[str, str]], trace: int
+    ) -> None:
         provider, colon, name = original.partition(':')
         if not colon:
             provider, name = 'ctf', original
         key = f'{_legal(provider)}:{_legal(name)}'
         self._names.add(key)
         event, converts = event_type(key, fields)
-        self._kinds[number] = self._file.define(event), converts if any(converts) else []
+        self._kinds[number] = self._file.define(event), converts if any(converts) else [], trace
 
     def finish(self) -> None:
         """Note what is missing or was changed."""
         result, path = self.result, self._path
         result.kinds = len(self._names)
+        self._repeated += self._several.repeated if self._several else 0
+        if self._repeated:
+            result.warnings.append(
+                f'{path}: {counted(self._repeated, "event")} in more than one session of a host: '
+                'each is used once')
         if result.discarded:
             about = ' at least' if self._uncounted else ''
             result.warnings.append(

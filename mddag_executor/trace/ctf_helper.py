@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Reads a CTF session with babeltrace2 and streams its events to `ctf`; a separate process.
+Reads CTF sessions with babeltrace2 and streams their events to `ctf`; a separate process.
 
 Theory of operation:
 
@@ -10,7 +10,7 @@ Theory of operation:
    ends.
 2. Standard output has one JSON row a line:
    `["missing", reason]` (no bt2 here; the only row), `["ready"]` (the first row),
-   `["class", number, name, [[field, type], ...]]` (before its first event),
+   `["class", number, name, [[field, type], ...], trace]` (before its first event),
    `["event", number, timestamp, vpid, vtid, procname, [value, ...]]`,
    `["discarded", timestamp, count]` (-1: unknown count),
    `["error", reason]` or `["end"]` (the last row). Output without a last row is incomplete.
@@ -157,8 +157,8 @@ class _Class(NamedTuple):
     identity: list[Callable[[Any, Any], Any] | None]
 
 
-class Session:
-    """The events of a session, as rows."""
+class Sessions:
+    """The events of the sessions of a host, as rows."""
 
     def __init__(self, bt2: Any, add: Callable[..., None]) -> None:
         self._bt2 = bt2
@@ -170,12 +170,13 @@ class Session:
         self._context_of = native.event_borrow_common_context_field_const
         # By address of the event's class, which is kept so that its address is not reused.
         self._known: dict[int, _Class] = {}
+        self._traces: dict[Any, int] = {}       # their numbers
 
-    def read(self, path: str) -> None:
-        """Write a row for each event below a folder, in the order of time."""
+    def read(self, paths: list[str]) -> None:
+        """Write a row for each event below some folders, in the order of time."""
         bt2 = self._bt2
         discarded = (bt2._DiscardedEventsMessageConst, bt2._DiscardedPacketsMessageConst)
-        for message in bt2.TraceCollectionMessageIterator(path):
+        for message in bt2.TraceCollectionMessageIterator(paths):
             if type(message) is bt2._EventMessageConst:
                 self._event(message)
             elif isinstance(message, discarded):
@@ -202,7 +203,9 @@ class Session:
             len(self._known), cls, [get for _, _, get in fields],
             [next((context[name] for name in names if name in context), None)
              for names in _IDENTITY])
-        self._add('class', known.number, cls.name or '', [field[:2] for field in fields])
+        trace = event.stream.trace      # the chunks of a session are one trace
+        self._add('class', known.number, cls.name or '', [field[:2] for field in fields],
+                  self._traces.setdefault(trace.uuid or trace.addr, len(self._traces)))
         return known
 
     def _discarded(self, message: Any) -> None:
@@ -227,8 +230,8 @@ def reason(error: BaseException) -> str:
     return ' '.join(str(text or error or type(error).__name__).split())
 
 
-def main(session: str) -> int:
-    """Read a session; the last row has the outcome."""
+def main(sessions: list[str]) -> int:
+    """Read the sessions of a host; the last row has the outcome."""
     # Output of libraries must not mix with the rows.
     with os.fdopen(os.dup(1), 'wb') as stream:
         os.dup2(2, 1)
@@ -241,7 +244,7 @@ def main(session: str) -> int:
         add('ready')
         stream.flush()
         try:
-            Session(bt2, add).read(session)
+            Sessions(bt2, add).read(sessions)
             add('end')
         except BrokenPipeError:
             os._exit(1)     # the importer has ended
@@ -254,4 +257,4 @@ if __name__ == '__main__':
     # Don't import from this file's folder: it has modules of the project.
     _here = os.path.dirname(os.path.abspath(__file__))
     sys.path[:] = [_path for _path in sys.path if os.path.abspath(_path or '.') != _here]
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main(sys.argv[1:]))

@@ -8,6 +8,8 @@ Linux assigns ids per computer and container, so two of them may have the same i
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
 _LINUX_IDS = 1 << 22    # Linux numbers processes and threads below this
 
 
@@ -15,10 +17,10 @@ class Numbers:
     """Ids of processes, or of threads: each belongs to one place."""
 
     def __init__(self) -> None:
-        self._given: dict[tuple[int, int], int] = {}
+        self._given: dict[tuple[Hashable, int], int] = {}
         self._used: set[int] = set()
 
-    def of(self, place: int, number: int) -> int:
+    def of(self, place: Hashable, number: int) -> int:
         """Return the unique id for an id of a place: the same if no other place has it."""
         found = self._given.get((place, number))
         if found is None:

@@ -17,7 +17,7 @@ trace {{
   major = 1; minor = 8; byte_order = le;
   packet.header := struct {{ uint32_t magic; uint32_t stream_id; }};
 }};
-clock {{ name = monotonic; freq = 1000000000; offset = {offset}; absolute = true; }};
+clock {{ name = monotonic; {boot}freq = 1000000000; offset = {offset}; absolute = true; }};
 typealias integer {{ size = 64; align = 8; map = clock.monotonic.value; }} := time_t;
 stream {{
   id = 0;
@@ -56,7 +56,7 @@ def stand_in(folder, monkeypatch, rows, then=''):
     return folder
 
 
-def session(folder, kinds, events, *, context=True, discarded=0, environment=None):
+def session(folder, kinds, events, *, context=True, discarded=0, environment=None, boot=None):
     """
     Write a trace into a new folder and return it.
 
@@ -65,11 +65,13 @@ def session(folder, kinds, events, *, context=True, discarded=0, environment=Non
     :param events: place in `kinds`, time since the clock's offset, pid, tid, procname, values
     :param discarded: events that the tracer says to have discarded in the second of two packets
     :param environment: what LTTng writes into the metadata, such as the hostname
+    :param boot: the UUID of the clock, which is that of the host's boot
     """
     folder.mkdir(parents=True)
     lines = ''.join(f'  {name} = "{value}";\n' for name, value in (environment or {}).items())
     text = _HEAD.format(
-        offset=CLOCK_OFFSET, context=CONTEXT if context else '',
+        offset=CLOCK_OFFSET, boot=f'uuid = "{boot}"; ' if boot else '',
+        context=CONTEXT if context else '',
         environment=f'env {{\n{lines}}};\n' if lines else '')
     for number, (name, fields) in enumerate(kinds):
         text += (f'event {{ name = "{name}"; id = {number}; stream_id = 0; fields := struct {{ '

@@ -122,7 +122,7 @@ def test_cut_metadata_is_found_before_babeltrace_reads_it(tmp_path):
             import_ctf(tmp_path, tmp_path / 'out.mcap')
 
 
-EVENTS = [['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']]],
+EVENTS = [['ready'], ['class', 0, 'ros2:callback_end', [['callback', 'uint64']], 0],
           ['event', 0, 5, 1, 2, 'p', [3]]]
 
 
