@@ -16,7 +16,7 @@ Now and then something makes it late:
 * *interpreter*: another callback keeps the interpreter's lock for 30 ms, with workers free;
 * *released late*: every third release is noticed 30 ms late;
 * *machine*: the process is stopped for 300 ms (SIGSTOP);
-* *lost*: every third message is not published.
+* *not published*: every third message is not published.
 
 Each run is a process of its own.  ``--scale`` makes all times longer, for busy machines.
 """
@@ -55,7 +55,7 @@ nodes:
 """
 #: By cause: about how often a deadline is missed, in periods.
 PERIODS = {'ran long': 3, 'waited': 3, 'group': 2, 'interpreter': 2, 'released late': 3,
-           'machine': 3, 'lost': 3}
+           'machine': 3, 'not published': 3}
 
 
 class Run:
@@ -95,7 +95,7 @@ class Run:
         if self._cause == 'waited' and third:
             for _ in range(10):
                 self._many.publish(Empty())
-        if self._cause != 'lost' or not third:
+        if self._cause != 'not published' or not third:
             self._data.publish(Empty())
 
     def _use(self, _: Empty) -> None:

@@ -719,7 +719,7 @@ class Engine:
         """Record what waits at the end as dispatched then: a reader sees that it was not lost."""
         for x, work in self._work.items():
             if (self._state.x_state[x] == WAITING and self._state.x_started[x] < 0
-                    and work.origin is not None and self.open_release(work.origin) is not None):
+                    and work.origin is not None):
                 self._record_dispatch(work, now, get_native_id(), -1)
 
     def release_of(self, work: Work) -> int:

@@ -14,13 +14,17 @@ along its critical chain (see ``chains``):
 * ready callback: *group* while another callback of its group ran; else *waited* while all workers
   were busy; else, with an idle worker, *interpreter* while any callback ran that may have held the
   GIL (undeclared callbacks: unknown), *machine* while none ran;
-* what a job *waited*, or waited for the *interpreter*, after it was demoted is *overload*;
+* the time that a job *waited*, or waited for the *interpreter*, after its demotion counts as
+  *demoted*; or as *less important* if the job could still have been in time when it was demoted,
+  so that it only made way for more important work;
 * running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
 * end of a callback until the next one is ready: *transport*;
 * job that ended early because of a callback that never ran, or a sync that did not get all of its
-  messages: *waited* if the callback was ready, else its message is *lost*.
+  messages: *dropped* if the executor dropped the message from its queue, *destroyed* if it did so
+  because the node or subscription was destroyed; *waited* if the callback was ready; *not
+  published* if the callback before it ended without publishing; else the message is *lost*.
 
 The largest part, beyond what is usual, is the cause of the miss.  Two rules precede:
 
@@ -29,9 +33,10 @@ The largest part, beyond what is usual, is the cause of the miss.  Two rules pre
 * If all unusual time together is less than the lateness, the usual times are too long for the
   deadline.  Then they count, too: usual execution times as *ran long*.
 
-A job whose callback raised has *failed*; a job that expired without its message has *lost* it.  A
-timer's release that was skipped because the previous execution still waited has the cause of the
-previous job; if that one was in time, it *waited*.
+A job whose callback raised has *failed*.  A job that expired because of a callback that never ran
+has the cause for which that callback did not run.  A timer's release that was skipped because the
+previous execution still waited has the cause of the previous job; if that one was in time, it
+*waited*.
 """
 
 from __future__ import annotations
@@ -44,9 +49,9 @@ from mddag_executor.replay.spans import Spans
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
-          'lost', 'failed', 'overload')
-(WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, LOST, FAILED, OVERLOAD,
- RAN_USUALLY, UNKNOWN, SKIPPED) = range(13)
+          'demoted', 'less important', 'dropped', 'destroyed', 'not published', 'lost', 'failed')
+(WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, DEMOTED, LESS_IMPORTANT,
+ DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, RAN_USUALLY, UNKNOWN, SKIPPED) = range(17)
 #: Kinds of time of a job; the last three are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown', 'skipped')
 #: By cause what to do about it.
@@ -59,21 +64,32 @@ REMEDIES = {
     'transport': 'let the nodes share a process, or send smaller messages',
     'machine': 'free the CPUs of other work, pin the workers, or take a machine that does not '
                'stand still',
-    'lost': 'if a process ended early (see the warnings), its end; else a longer queue (QoS '
-            'depth), reliable QoS, or a publisher that always publishes',
-    'failed': 'mend what the callback raises',
-    'overload': 'less work, or a lower importance or longer deadline of what ran instead'}
+    'demoted': 'less work, or a longer deadline: it could no longer be in time, so others went '
+               'first',
+    'less important': 'less work of higher importance, or a higher importance of this sink',
+    'dropped': 'shorter callbacks before it, or a longer queue (QoS depth, or without '
+               '`keep: newest`)',
+    'destroyed': 'keep the node and its subscription until the job has ended',
+    'not published': 'publish in each execution of the callback before it',
+    'lost': 'reliable QoS or a longer queue (QoS depth); if a process ended early (see the '
+            'warnings), its end',
+    'failed': 'mend what the callback raises'}
+_DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED}
+"""By reason of a drop its cause; jobs are aborted because of an earlier miss: they *waited*."""
+NO_MESSAGE = (DROPPED, DESTROYED, NOT_PUBLISHED, LOST)
+"""Causes for which a callback never ran."""
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th above the usual time is usual
-_WAITS = (WAITED, INTERPRETER, GROUP, OVERLOAD)
+_ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
+_WAITS = (*_ON_WORKERS, INTERPRETER, GROUP)
 _MOST_BEHIND = 5
 
 MISSED = np.dtype([
     ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
-    ('at', 'i8'), ('length', 'i8'), ('demoted', 'i8')])
+    ('at', 'i8'), ('length', 'i8'), ('demoted', 'i8'), ('outranked', '?')])
 """
 Columns of a miss: ``at`` is the vertex that the job reached, ``length`` the length of its chain,
-``demoted`` when it was demoted.
+``demoted`` when it was demoted, ``outranked`` whether it could still have been in time then.
 """
 PARTS_OF = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('cause', 'i8'), ('begin', 'i8'), ('end', 'i8'),
@@ -127,12 +143,31 @@ class Never(NamedTuple):
     """
     What is known of executions that never ran.
 
-    :ivar dropped: by vertex and job the reason why the execution was dropped.
+    :ivar dropped: by vertex and job why the execution was dropped, and when.
+    :ivar dropped_at: by vertex when executions were dropped whose jobs are not recorded.
     :ivar started: executions that were started, a table of ``STARTED``.
+    :ivar unpublished: vertices and jobs whose message the callback before did not publish.
     """
 
-    dropped: dict[tuple[int, int], str]
+    dropped: dict[tuple[int, int], tuple[str, int]]
+    dropped_at: dict[int, Ints]
     started: Table
+    unpublished: set[tuple[int, int]]
+
+    def why_dropped(self, key: tuple[int, int]) -> str | None:
+        """Return why the execution of a vertex and job was dropped; None: it was not."""
+        return self.dropped.get(key, (None, 0))[0]
+
+    def cause(self, key: tuple[int, int], begin: int, end: int) -> int:
+        """Return why the execution of a vertex and job never ran; it did not wait at the end."""
+        reason = self.why_dropped(key)
+        if reason is not None:
+            return _DROPS.get(reason, WAITED)
+        if key in self.unpublished:
+            return NOT_PUBLISHED
+        times = self.dropped_at.get(key[0], ())
+        first, last = np.searchsorted(times, (begin, end))
+        return DROPPED if last > first else LOST
 
     def waiting(self, vertices: Ints, times: Ints) -> Ints:
         """Return by vertex the job whose execution waited at the given time, or -1."""
@@ -204,7 +239,8 @@ def find(
         for part in (WAITED, INTERPRETER):
             moved = np.where(waits, np.minimum(times[:, part], demoted), 0)
             times[:, part] -= moved
-            times[:, OVERLOAD] += moved
+            times[:, DEMOTED] += np.where(rows['outranked'][of], 0, moved)
+            times[:, LESS_IMPORTANT] += np.where(rows['outranked'][of], moved, 0)
             demoted -= moved
     total = np.zeros((len(rows), len(PARTS)), dtype=np.int64)
     np.add.at(total, of, times)
@@ -301,9 +337,11 @@ def _pending(
     rows: Table, spans: Table, times: Ints, left: Ints, never: Never, pool: Pool, is_source: Any
 ) -> None:
     """
-    Find what callbacks that never ran were pending for: they waited, or their message is lost.
+    Find what callbacks that never ran were pending for: they waited, or ``Never.cause``.
 
-    A timer's skipped release waited if all workers were busy for most of the time.
+    A timer's skipped release waited if all workers were busy for most of the time; otherwise an
+    execution before it waited, or it was noticed late.  The part of a dropped execution ends with
+    the drop.
     """
     pending = np.flatnonzero(spans['kind'] == _PENDING)
     started = never.started
@@ -316,17 +354,19 @@ def _pending(
         miss, vertex, _, begin, end, _ = spans[i].item()
         key = vertex, int(rows['job'][miss])
         ready, start, group = waiting.get(key, (end, end, 0))
-        waits = (ready < end <= start or never.dropped.get(key) == 'aborted'
-                 or is_source[vertex] and never.dropped.get(key) == 'newer')
+        waits = ready < end <= start or never.why_dropped(key) == 'aborted'
         if not waits and key not in never.dropped and (
                 rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
             full, = pool.full.within(*(np.array([each]) for each in (begin, end)))
             waits = pool.knows_workers and 2 * int(full) >= end - begin
         if waits:
             spans['kind'][i], spans['more'][i] = _WAIT, min(group, end - begin)
+        elif is_source[vertex] and key not in never.dropped:
+            times[i, SKIPPED if waiting_job >= 0 else RELEASED_LATE] = left[i]
         else:
-            is_skipped = is_source[vertex] and key not in never.dropped and waiting_job >= 0
-            times[i, SKIPPED if is_skipped else LOST] = left[i]
+            times[i, never.cause(key, begin, end)] = left[i]
+            if key in never.dropped:
+                spans['end'][i] = min(end, max(begin, never.dropped[key][1]))
 
 
 def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:
@@ -343,7 +383,7 @@ def _causes(
     for stall in pool.stalls:
         credit[delayed_by(rows, stall)] += stall[1] - stall[0]
     after_stall = credit > 0
-    for cause in (WAITED, INTERPRETER, GROUP, OVERLOAD, RELEASED_LATE, TRANSPORT):
+    for cause in (WAITED, INTERPRETER, GROUP, DEMOTED, LESS_IMPORTANT, RELEASED_LATE, TRANSPORT):
         moved = np.minimum(credit, amounts[:, cause])
         amounts[:, cause] -= moved
         amounts[:, MACHINE] += moved
@@ -352,7 +392,7 @@ def _causes(
     causes[rows['kind'] == SINK_FAILED] = FAILED
     given_up = np.flatnonzero(
         np.isin(rows['kind'], (SINK_EXPIRED, SINK_ABORTED))
-        & ((total[:, LOST] + total[:, SKIPPED] > 0) | (amounts.max(axis=1) == 0)))
+        & ((total[:, [*NO_MESSAGE, SKIPPED]].sum(axis=1) > 0) | (amounts.max(axis=1) == 0)))
     causes[given_up] = _given_up(
         rows, given_up, causes, np.where(after_stall, MACHINE, RELEASED_LATE), never, is_source)
     return causes
@@ -368,11 +408,13 @@ def _given_up(
     :param skipped: causes of skipped releases for which no execution waited.
     """
     found = causes[which]
-    kind, job, at, until = (rows[name][which] for name in ('kind', 'job', 'at', 'until'))
+    kind, job, at, release, until = (
+        rows[name][which] for name in ('kind', 'job', 'at', 'release', 'until'))
     dropped = np.array(
         [key in never.dropped for key in zip(at.tolist(), job.tolist())], dtype=np.bool_)
     skips = is_source[at] & ~dropped
-    found[~skips & (dropped | (kind == SINK_EXPIRED))] = LOST
+    for i in np.flatnonzero(~skips & (dropped | (kind == SINK_EXPIRED))).tolist():
+        found[i] = never.cause((int(at[i]), int(job[i])), int(release[i]), int(until[i]))
     found[skips] = skipped[which[skips]]
     before = never.waiting(at, until)
     waits = skips & (before >= 0) & (found != MACHINE)
@@ -403,7 +445,7 @@ def behind(
     callbacks, parts = list(runs), parts[chosen]
     begins, ends = parts['begin'], parts['end']
     times = np.array([each.within(begins, ends) for each in runs.values()])
-    waited = np.isin(parts['cause'], (WAITED, OVERLOAD))
+    waited = np.isin(parts['cause'], _ON_WORKERS)
     times[:, waited] = [
         each.within(begins[waited], ends[waited]) for each in on_workers.values()]
     grouped = parts['cause'] == GROUP

@@ -26,6 +26,7 @@ from mddag_executor.recording.tables import (
     different,
     in_parts,
     Ints,
+    Mask,
     Recording,
     rows,
     rows_by,
@@ -37,10 +38,10 @@ from mddag_executor.replay.causes import (
     CAUSES,
     delayed_by,
     find,
-    LOST,
     MACHINE,
     MISSED,
     Never,
+    NO_MESSAGE,
     PARTS,
     Pool,
     RAN_LONG,
@@ -53,10 +54,13 @@ from mddag_executor.replay.chains import Chains, LINKS
 from mddag_executor.replay.deadlines import Judged
 from mddag_executor.replay.spans import crowded, Spans
 from mddag_executor.replay.usage import in_groups, ran
+from msg_graph.model import topological_order
 import numpy as np
 
 _NO_END = 2 ** 62
 _STEPS = 32     # per octave
+_ROUGHLY_NS = 1_000_000
+"""A demotion this shortly before the latest start may be because of lateness."""
 
 
 class Explanation:
@@ -74,11 +78,14 @@ class Explanation:
             recording.processes == 1 and not (policy is not None and policy.polling) else 0
         #: Begin and end of each stop of the machine.
         self.stops = self._stops()
+        self._to_sinks: dict[int, dict[int, int]] = {}
         missed, links = self._missed(judged, chains)
-        pool = self._pool(missed)
-        self._never = Never(self._dropped(), self._started(chains.waited))
+        pool, usual = self._pool(missed), self._usual()
+        missed['outranked'] = self._outranked(missed, links, usual)
+        self._never = Never(
+            *self._dropped(), self._started(chains.waited), self._unpublished(missed))
         self.found = find(
-            missed, links, pool, self._usual(), self._never,
+            missed, links, pool, usual, self._never,
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
             np.array([*self._tables.sink_deadline, 0], dtype=np.int64),
             np.array([*(not v.predecessors for v in self._task_set.vertices), False]))
@@ -152,11 +159,88 @@ class Explanation:
             releases['dag'], releases['noticed'] - releases['release'], len(task_set.dags) + 1)
         return Usual(np.minimum(runs[place], np.array([*longest, 0])), computed[place], lags)
 
-    def _dropped(self) -> dict[tuple[int, int], str]:
-        """Return why executions were dropped, by vertex and job."""
+    def _outranked(self, missed: Table, links: Table, usual: Usual) -> Mask:
+        """
+        Return which misses were demoted while they could still be in time.
+
+        These made way for more important work.  The latest start is that of the callback that
+        waited then, by the usual times of it and of those after it.  The executor estimates these
+        times itself, so a demotion shortly before is not counted.
+        """
+        importance = np.array([*self._tables.importance, 0])
+        found: Mask = (missed['demoted'] < _NO_END) & (
+            importance[missed['sink']] < importance[:-1].max(initial=0))
+        waits = links[found[links['of']]]
+        waits = waits[(waits['ready'] <= missed['demoted'][waits['of']])
+                      & (waits['start'] >= missed['demoted'][waits['of']])]
+        at = missed['at'].copy()
+        at[waits['of']] = waits['vertex']
+        for miss in np.flatnonzero(found).tolist():
+            sink, release, demoted = (
+                int(missed[name][miss]) for name in ('sink', 'release', 'demoted'))
+            left = release + self._tables.sink_deadline[sink] - demoted
+            needed = self._longest(usual.runs, sink).get(int(at[miss]), 0)
+            found[miss] = left > needed + max(_ROUGHLY_NS, needed // 4)
+        return found
+
+    def _longest(self, runs: Ints, sink: int) -> dict[int, int]:
+        """Return by vertex that leads to a sink the usual time until the sink is completed."""
+        if sink not in self._to_sinks:
+            dag = self._task_set.dags[self._tables.dag_of[sink]]
+            first, found = self._tables.first_vertex[dag.index], dict[int, int]()
+            for v in reversed(topological_order(dag)):
+                after = [found[first + each] for each in dag.vertices[v].successors
+                         if first + each in found]
+                if first + v == sink or after:
+                    found[first + v] = int(runs[first + v]) + max(after, default=0)
+            self._to_sinks[sink] = found
+        return self._to_sinks[sink]
+
+    def _dropped(self) -> tuple[dict[tuple[int, int], tuple[str, int]], dict[int, Ints]]:
+        """Return why and when executions were dropped, by vertex and job; and without a job."""
         drops, reasons = self._recording.drops, self._recording.drop_reasons
-        return {(vertex, job): reasons[reason] for vertex, job, reason in zip(
-            *(drops[name].tolist() for name in ('vertex', 'job', 'reason')))}
+        place = np.array([*self._task_set.places_of_vertices(), -1])
+        without = drops[(drops['job'] < 0) & (drops['vertex'] >= 0)]
+        of = place[without['vertex']]
+        return {(vertex, job): (reasons[reason], time) for vertex, job, reason, time in zip(
+            *(drops[name].tolist() for name in ('vertex', 'job', 'reason', 'time')))}, {
+            vertex: np.sort(without['time'][of == place[vertex]])
+            for vertex in np.flatnonzero(np.isin(place[:-1], of)).tolist()}
+
+    def _unpublished(self, missed: Table) -> set[tuple[int, int]]:
+        """
+        Return by vertex and job the callbacks that lack a message which was not published.
+
+        The callback before completed in this job and did not publish the topic.
+        """
+        recording, table = self._recording, self._executions
+        if not recording.who.every_publisher:
+            return set()    # a simulated run: its callbacks always publish
+        wanted = {(vertex, job) for vertex, job in zip(
+            missed['at'].tolist(), missed['job'].tolist())}
+        legs = {vertex: self._topics(vertex) for vertex, _ in wanted}
+        before = {publisher for each in legs.values() for publisher, _ in each}
+        of = np.flatnonzero(np.isin(table['vertex'], list(before)))
+        completed = set(zip(*(table[name][of[table['completes'][of] == VERTEX]].tolist()
+                              for name in ('vertex', 'job'))))
+        sent = recording.publications
+        sent = sent[np.isin(sent['execution'], of)]
+        published: defaultdict[tuple[int, int], set[str]] = defaultdict(set)
+        for vertex, job, number in zip(*(
+                table[name][sent['execution']].tolist() for name in ('vertex', 'job')),
+                sent['publisher'].tolist()):
+            publisher = recording.who.every_publisher.get(number)
+            published[vertex, job].add('' if publisher is None else publisher.topic)
+        return {(vertex, job) for vertex, job in wanted for publisher, topic in legs[vertex]
+                if (publisher, job) in completed and topic not in published[publisher, job]
+                and '' not in published[publisher, job]}
+
+    def _topics(self, vertex: int) -> list[tuple[int, str]]:
+        """Return the vertices that publish for a vertex, and the topic of each."""
+        one = self._task_set.vertices[vertex]
+        first = self._tables.first_vertex[one.dag]
+        return [(first + before, one.callback.topics[place]) for place, before in legs_of(
+            one, self._task_set.dags[one.dag].vertices) if one.callback.topics]
 
     def _started(self, in_group: Ints) -> Table:
         """Return the executions that were started, and sources that waited until a drop."""
@@ -294,7 +378,7 @@ class Explanation:
         if part['cause'] == SKIPPED:
             found['waiting_job'] = int(self._never.waiting(
                 part['vertex'][None], part['end'][None])[0])
-        if part['cause'] == LOST:
+        if part['cause'] in NO_MESSAGE:
             found['topics'] = self._missing(int(part['vertex']), job)
         return found
 

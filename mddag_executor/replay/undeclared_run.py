@@ -26,7 +26,6 @@ the causes of executions.  Differences:
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter
 
 from mddag_executor.recording.entities import INIT_EVENTS
 from mddag_executor.recording.executions import number_pieces
@@ -143,13 +142,20 @@ class UndeclaredRun(ImportedRun):
         found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
         if not found.shut_down:
             found.warnings.append(no_end(self.name))
-        reasons = Counter(str(event[4 + event[0].fields.index('reason')])
-                          for event in self._events.others if event[0].name == _DROP
-                          and 'reason' in event[0].fields)
-        found.drop_reasons = tuple(reasons)
+        drops, reasons = [], dict[str, int]()
+        for event in self._events.others:
+            if event[0].name != _DROP or not {'callback', 'reason'} <= {*event[0].fields}:
+                continue
+            _, time, pid, _, *values = event
+            fields = dict(zip(event[0].fields, values))
+            callback = self.who.callbacks.latest(pid, fields['callback'], time)
+            drops.append((
+                UNKNOWN if callback is None else self._vertex.get(callback.number, UNKNOWN),
+                time, reasons.setdefault(str(fields['reason']), len(reasons))))
+        vertex, times, reason = zip(*drops) if drops else ((), (), ())
         found.drops = rows(
-            DROPS, reasons.total(), vertex=UNKNOWN, job=UNKNOWN, time=UNKNOWN,
-            reason=[number for number, n in enumerate(reasons.values()) for _ in range(n)])
+            DROPS, len(drops), vertex=vertex, job=UNKNOWN, time=times, reason=reason)
+        found.drop_reasons = tuple(reasons)
         return found
 
     def _judged_until(self) -> int:

@@ -196,6 +196,30 @@ def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):
     assert [each.kind for each in outcome.drift()] == []
 
 
+def test_what_the_executor_dropped_was_not_lost(make_executor, make_node, tmp_path):
+    """A queue of one message, whose callback is blocked while others arrive."""
+    text = graph(
+        a='name: tick, timer: 10ms, publishes: [/data]',
+        b='name: use, subscription: /data, deadline: 5ms')
+    path = tmp_path / 'dropped.mcap'
+    node, reader = make_node('a'), make_node('b')
+    begun, go_on, sent = threading.Event(), threading.Event(), []
+    publisher = node.create_publisher(Header, '/data', 10)
+    node.create_timer(0.01, lambda: (sent.append(1), publisher.publish(Header())))
+    reader.create_subscription(Header, '/data', lambda _: (begun.set(), go_on.wait(30.0)), 1)
+    executor = make_executor(
+        loads(text, 'g.yaml'), num_workers=2, trace=str(path), nodes=[node, reader])
+    with Spinning(executor):
+        assert begun.wait(15.0)
+        before = len(sent)
+        assert wait_for(lambda: len(sent) >= before + 30)
+        go_on.set()
+    outcome = replay(path)
+    assert outcome.warnings == []
+    causes = outcome.explanation.summary()['sinks']['/b:use']
+    assert causes['dropped'] > 15 and not causes['lost'] and not causes['not published']
+
+
 def test_requests_that_arrive_together_are_recorded_one_by_one(make_executor, make_node, tmp_path):
     path, node, ran = tmp_path / 'requests.mcap', make_node(), []
 
@@ -236,7 +260,7 @@ def test_the_cause_of_most_misses(tmp_path):
                 break
         return told
 
-    kinds = ['waited', 'machine', 'lost']
+    kinds = ['waited', 'machine', 'not published']
     with ThreadPoolExecutor() as pool:
         for cause, told in zip(kinds, pool.map(found, kinds)):
             assert told.get(cause, 0) >= 5, cause

@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core.tally import counts, total
 from mddag_executor.replay import open_recording, replay, reschedule
-from mddag_executor.replay.causes import CAUSES
+from mddag_executor.replay.causes import CAUSES, REMEDIES
 import pytest
 
 from ..conftest import examples
@@ -227,6 +227,73 @@ def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path, call):
     assert 'lost: /image' in call('explain', path, '--job', '3').stdout
 
 
+@pytest.mark.parametrize(('cause', 'drop', 'published'), [
+    ('dropped', 'qos_depth', True), ('dropped', 'newer', True), ('destroyed', 'destroyed', True),
+    ('not published', None, False), ('lost', None, True)])
+def test_a_callback_that_never_ran_has_the_cause_that_is_recorded(
+        cause, drop, published, tmp_path, call):
+    # every second message of the sensor starts nothing
+    trace = Written(tmp_path / 'run.mcap', VICTIM, 2)
+    trace.add('rcl_node_init', 0, 5, 5, 'sensor', '/')
+    trace.add('rcl_publisher_init', 0, 7, 5, 7, '/data', 10)
+    trace.add('rcl_publisher_init', 0, 8, 5, 8, '/other', 10)
+    for job in range(20):
+        at = job * 50
+        trace.release(0, job, at)
+        trace.add('rclcpp_publish', at + 0.25, 8, 0, 0, thread=10)
+        if published or job % 2:
+            trace.add('rclcpp_publish', at + 0.5, 7, 0, 0, thread=10)
+        trace.run(0, TICK, job, at, at + 1)
+        for dag in (1, 2):
+            trace.release(dag, job, at + 1)
+            trace.run(dag, 0, job, at + 1, at + 30, worker=dag - 1)
+        if job % 2:
+            trace.run(0, USE, job, at + 2, at + 3, worker=1)
+            continue
+        if drop is not None:
+            trace.add('drop', at + 31, 1001, 0, USE, job, drop)
+        trace.add('expire', at + 45, 0, job)
+    path = trace.end(1000)
+    result = explained(path)
+    assert result['causes'][cause] == result['missed'] == 10
+    part = result['jobs'][0]['parts'][-1]
+    assert (part['vertex'], part['cause'], part['topics']) == ('/victim:use', cause, ['/data'])
+    assert {each['callback'] for each in part['behind']} == (
+        {'/heavy:first', '/heavy:second'} if cause == 'dropped' else set())
+    text = call('explain', path).stdout
+    assert f'{cause}: /data' in text and f'10 misses: 10 {cause}\n' in text
+    assert REMEDIES[cause] in text
+
+
+def test_lateness_is_told_from_importance(tmp_path):
+    # both sinks are demoted and start after 80 ms: the one when its deadline was out of reach,
+    # the other one at once, for the more important one
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+workers: 1
+nodes:
+  - {node: /a, callbacks: [{name: main, dag: a, timer: 1s, deadline: 90ms, importance: high}]}
+  - {node: /b, callbacks: [{name: late, dag: b, timer: 1s, deadline: 20ms}]}
+  - {node: /c, callbacks: [{name: less, dag: c, timer: 1s, deadline: 20ms}]}
+""")
+    for job in range(10):
+        at = job * 1000
+        for dag in (0, 1, 2) if job % 2 else (1, 2):
+            trace.release(dag, job, at)
+        if job % 2:
+            trace.run(0, 0, job, at, at + 80)
+            trace.add('demote', at + 1, 2, 0, job)
+            trace.add('demote', at + 16, 1, 0, job)
+        start = at + (80 if job % 2 else 1)
+        trace.run(1, 0, job, start, start + 5, ready=at)
+        trace.run(2, 0, job, start + 5, start + 10, ready=at)
+    result = explained(trace.end(10000))
+    assert result['sinks'] == {name: {**dict.fromkeys(CAUSES, 0), cause: 5} for name, cause in (
+        ('/b:late', 'demoted'), ('/c:less', 'less important'))}
+    assert all(part['behind'][0]['callback'] == '/a:main' for job in result['jobs']
+               for part in job['parts'] if part['cause'] in ('demoted', 'less important'))
+
+
 def test_only_misses_in_stops_are_said_to_be_in_them(tmp_path, call):
     # each job's callback starts 20 ms after it was ready, with an idle worker; the machine stood
     # still twice in that of one job, and once in that of another
@@ -275,7 +342,8 @@ nodes:
         in lines
     assert '0 results due, 0 in time (-), 0 late, 0 expired' in lines   # and none demoted
     explained = call('explain', trace, '--json', '-').result
-    assert explained['missed'] == explained['causes']['overload'] >= 50  # all there is no time for
+    # all there is no time for
+    assert explained['missed'] == explained['causes']['less important'] >= 50
     behind = {each['callback'] for job in explained['jobs'] for part in job['parts']
               for each in part['behind']}
     assert '/n:main' in behind

@@ -220,3 +220,4 @@ def test_a_job_that_is_open_at_the_end_is_judged_by_that(run):
     sink = of_camera(result)
     assert (sink['completed'], sink['late'], sink['overdue']) == (0, 1, 1)
     assert result['dropped'] == {'qos_depth': 1}
+    assert result['misses']['causes']['dropped'] == 1
