@@ -24,7 +24,10 @@ sequence number, and job.  Both processes have the same system clock.
     announced in order, so its messages stay in order.
 4.  Announced publications are looked up with those of this process, by one rule (``Jobs.find``):
     window and sequence number.
-5.  Executors understand each other only if they have the same declaration: its digest is in the
+5.  *Announcements come from outside.*  One that cannot be true (an unknown vertex or topic, a
+    release in the future or long ago) is ignored.  They are handled before all callbacks, so they
+    get a twentieth of a core at most; those beyond that are ignored, too, with a warning.
+6.  Executors understand each other only if they have the same declaration: its digest is in the
     name of the topic.  Each process has its own topic, so that it does not receive its own
     announcements.
 """
@@ -32,13 +35,14 @@ sequence number, and job.  Both processes have the same system clock.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 import hashlib
 import os
 import struct
 import time
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.executor.bounds import REMEMBERED
+from mddag_executor.executor.bounds import LOG_EVERY_S, REMEMBERED
 from mddag_executor.executor.jobs import (
     Announced,
     NO_ORIGIN,
@@ -52,6 +56,7 @@ from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.work import Work
 from msg_graph import TaskSet
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.logging import get_logger
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
@@ -63,6 +68,12 @@ WAIT_NS = 100_000_000
 """How long a message waits for its announcement; this is checked twice in that time."""
 _QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000)
+OLDEST_NS, LATEST_NS = 3_600_000_000_000, 1_000_000_000
+"""How long before now, and after it, the release of an announced job may be."""
+MOST_ENTRIES = 256
+"""The most publications that are announced together: those of one topic that overlap."""
+SHARE, SAVED_NS = 20, 20_000_000
+"""Announcements get this part of a core (1 of ``SHARE``), and may save this time of it."""
 # sender, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
 _ENTRY = struct.Struct('<QQQqqQQqiiI')
 
@@ -88,6 +99,10 @@ class Announcements:
         # until when (trace's clock) each message waits, and its info from the middleware
         self._waiting: list[tuple[int, Work, dict[str, Any]]] = []
         self._checked_at = 0
+        # the time that may be spent on announcements, and when it was last updated, ns
+        self._allowance = SAVED_NS
+        self._allowed_at = time.monotonic_ns()
+        self._warn_at = 0
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
         own = names.index(process)
@@ -155,15 +170,45 @@ class Announcements:
 
     def _hear(self, message: UInt8MultiArray) -> None:
         """Handle announcements of another process; pass on the messages that waited for them."""
-        if len(message.data) % _ENTRY.size:
+        size, rest = divmod(len(message.data), _ENTRY.size)
+        if rest or size > MOST_ENTRIES or not self._may_hear():
             return
         for entry in _ENTRY.iter_unpack(message.data):
-            self._note(*entry)
+            if self._is_plausible(*entry[-4:]):
+                self._note(*entry)
         for entry in list(self._waiting):
             origin = self._find(entry[1], entry[2])
             if origin is not None:
                 self._waiting.remove(entry)
                 self._give(entry[1], origin)
+        self._allowance -= time.monotonic_ns() - self._allowed_at
+
+    def _may_hear(self) -> bool:
+        """Return whether announcements have taken no more than their share of the time."""
+        before, now = self._allowed_at, time.monotonic_ns()
+        self._allowed_at = now
+        self._allowance = min(SAVED_NS, self._allowance + (now - before) // SHARE)
+        if self._allowance > 0:
+            return True
+        if now > self._warn_at:
+            self._warn_at = now + int(LOG_EVERY_S * 1e9)
+            self._pool.deferred.append(partial(
+                get_logger('mddag_executor').warning,
+                'announcements of jobs are ignored: more arrive than the executors of the '
+                'declared processes can send; another program publishes on '
+                f'{self.subscriptions[0].topic_name} or its siblings'))
+        return False
+
+    def _is_plausible(self, release: int, dag: int, vertex: int, topic: int) -> bool:
+        """Return whether an announcement may be true: it comes from outside."""
+        if topic >= len(self._topics):
+            return False
+        if dag < 0:  # a publication of no job
+            return True
+        first = self._engine.tables.first_vertex
+        now = self._allowed_at
+        return (dag < len(self._engine.dag_names) and first[dag] <= vertex < first[dag + 1]
+                and now - OLDEST_NS <= release <= now + LATEST_NS)
 
     def _give(self, work: Work, origin: Origin | Announced | None) -> None:
         """Pass on a message after a possible wait for its announcement."""
@@ -179,13 +224,12 @@ class Announcements:
         self, whose: int, of: int, sequence: int, begin: int, end: int, home: int, number: int,
         release: int, dag: int, vertex: int, topic: int,
     ) -> None:
-        if topic < len(self._topics) and dag < len(self._engine.dag_names):  # else unknown
-            publisher = self._publishers.pop((whose, of), None) or PublisherNumbers()
-            self._publishers[whose, of] = publisher  # the latest is last
-            if len(self._publishers) > REMEMBERED:
-                del self._publishers[next(iter(self._publishers))]
-            self._jobs.note_announced(self._topics[topic], Publication(
-                begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
+        publisher = self._publishers.pop((whose, of), None) or PublisherNumbers()
+        self._publishers[whose, of] = publisher  # the latest is last
+        if len(self._publishers) > REMEMBERED:
+            del self._publishers[next(iter(self._publishers))]
+        self._jobs.note_announced(self._topics[topic], Publication(
+            begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
 
     def _find(
         self, work: Work, info: dict[str, Any], counted: bool = False

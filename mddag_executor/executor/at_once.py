@@ -18,6 +18,7 @@ import threading
 from time import monotonic_ns
 from typing import Any
 
+from mddag_executor.core import NEVER
 from mddag_executor.executor import compat
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
@@ -49,8 +50,8 @@ class AtOnce:
         for source in self.loop.sources(events):
             with self.pool.lock if isinstance(source, TimerSource) else nullcontext():
                 source.collect()
-        if self.timers.has_jumped or 0 < self.loop.timer.at <= monotonic_ns():
-            self.loop.timer.at = 0
+        if self.timers.has_jumped or self.loop.timer.at <= monotonic_ns():
+            self.loop.timer.at = NEVER
             with self.pool.lock:
                 fired = list(self.timers.fire())
             for work, *_ in fired:

@@ -87,11 +87,11 @@ class DueTimes:
             self._check_context_at = monotonic + 20 * AGAIN_NS
             if is_over(pool.executor.context):
                 pool.executor.wake()
-        self._timer.at = 0
+        self._timer.at = NEVER
         pool.fire_timers()
         if now > self._engine.deadlines.next:
             self._engine.judge_overdue(now)
-        if 0 < self._gil_check.at <= monotonic:
+        if self._gil_check.at <= monotonic:
             self._check_gil(monotonic)
         if 0 < pool.muting.until <= now:
             pool.muting.end()
@@ -104,12 +104,12 @@ class DueTimes:
         pool = self._pool
         deadline = self.deadline = self._engine.deadlines.next
         if not pool.running:
-            self._timer.arm(0)
+            self._timer.arm(NEVER)
             return
         offset, muting, check = self._offset, pool.muting, self._gil_check
         self._timers.has_new = False
         timer = muting.next_timer()
-        first = timer or NEVER
+        first = timer
         if deadline < NEVER:
             first = min(first, deadline - offset + 1)
         if now + offset < self._engine.check_at < NEVER:
@@ -121,10 +121,8 @@ class DueTimes:
         if self._engine.holders and self._engine.has_waiting:
             self._watch_holder(now)
             first = min(first, self._next_check(now))
-        elif check.at:
+        elif check.at < NEVER:
             check.end()
-        if first == NEVER:
-            first = 0
         self.may_expire_early = first != timer
         if first != self._timer.at:
             self._timer.arm(first)
@@ -134,7 +132,7 @@ class DueTimes:
     @property
     def is_checking(self) -> bool:
         """Return whether a check is due at some time."""
-        return self._gil_check.at > 0
+        return self._gil_check.at < NEVER
 
     def check_holder(self, now: int, is_late: bool = False) -> None:
         """
@@ -152,11 +150,11 @@ class DueTimes:
         if not self._engine.holders:
             return NEVER
         at = self._engine.overtaking_at() - self._offset
-        return min(at if at > now else NEVER, self._gil_check.at or NEVER)
+        return min(at if at > now else NEVER, self._gil_check.at)
 
     def _arm_by(self, at: int) -> None:
         """Set the timerfd to a time, unless it expires sooner."""
-        if at < NEVER and not 0 < self._timer.at <= at:
+        if at < self._timer.at:
             self.may_expire_early = True
             self._timer.arm(at)
 
@@ -192,7 +190,7 @@ class DueTimes:
         at, cpu = self._timer.at, process_time_ns()
         seen, used = self._seen
         self._seen = now, cpu
-        if at and now - max(at, seen) >= STOP_NS:
+        if now - max(at, seen) >= STOP_NS:
             waited = self._pool.waited_since(since) - self._offset
             late = now - max(at, seen, waited) - (cpu - used)
             if late >= STOP_NS:
@@ -295,7 +293,7 @@ class Muting:
         self._pool.loop.move(source, is_patient and self._has_long and bool(habit.computes))
 
     def next_timer(self) -> int:
-        """Return when the next timer that could start is due (monotonic ns); 0: never."""
+        """Return when the next timer that could start is due (monotonic ns); NEVER: never."""
         return self._pool.timers.next_due_of(self._could_start) if self.until else (
             self._pool.timers.next_due())
 

@@ -43,6 +43,8 @@ import threading
 from time import clock_gettime_ns, process_time_ns, pthread_getcpuclockid, thread_time_ns
 from typing import NamedTuple
 
+from mddag_executor.core import NEVER
+
 COMPUTES = 0.8
 """A callback that computes for this fraction of its time holds the GIL."""
 WAITS = 0.5
@@ -241,14 +243,14 @@ class GilCheck:
     """
     Finds out whether an execution that holds the GIL computes.
 
-    :ivar at: when to check next, monotonic ns; 0: never.
+    :ivar at: when to check next, monotonic ns; NEVER: never.
     :ivar subject: the execution to check.
     """
 
     __slots__ = ('at', 'subject', '_step', '_last', '_unclear')
 
     def __init__(self) -> None:
-        self.at = 0
+        self.at = NEVER
         self.subject: object = None
         self._step = 0
         self._last: _Reading | None = None
@@ -271,7 +273,7 @@ class GilCheck:
     def end(self) -> None:
         """Stop checking."""
         self.subject = None
-        self.at = 0
+        self.at = NEVER
 
     def waits(self, ident: int, tid: int, now: int) -> bool:
         """

@@ -23,6 +23,7 @@ import os
 import time
 from typing import Any
 
+from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
 
 _libc = ctypes.PyDLL(None, use_errno=True)  # no call blocks, so the GIL is kept
@@ -120,7 +121,7 @@ class TimerFd:
     A timerfd on the monotonic clock.
 
     :ivar fd: becomes readable at the set time.
-    :ivar at: that time, monotonic ns; 0: none is set.
+    :ivar at: that time, monotonic ns; NEVER: none is set.
     """
 
     __slots__ = ('fd', 'at', '_time', '_address')
@@ -129,12 +130,19 @@ class TimerFd:
         self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self.fd < 0:
             raise OSError(ctypes.get_errno(), 'timerfd_create')
-        self.at = 0
+        self.at = NEVER
         self._time = array('q', (0, 0, 0, 0))  # interval, then time: seconds, nanoseconds
         self._address = ctypes.c_void_p(self._time.buffer_info()[0])
 
     def arm(self, at: int) -> None:
-        """Set the time (monotonic ns); 0: none."""
+        """
+        Set the time (monotonic ns); NEVER, or any later time: none.
+
+        A time in the past, also one before the boot of the machine, expires at once.
+        """
         self.at = at
-        self._time[2], self._time[3] = divmod(at, 1_000_000_000)
-        _timer_settime(self.fd, 1, self._address, None)  # 1: TFD_TIMER_ABSTIME
+        # the system call knows no negative times, and 0 stands for none
+        self._time[2:] = array('q', divmod(max(1, at), 1_000_000_000) if at < NEVER else (0, 0))
+        # 1: TFD_TIMER_ABSTIME
+        if _timer_settime(self.fd, 1, self._address, None) != 0 and self.fd >= 0:
+            raise OSError(f'timerfd_settime does not accept {self._time[2:].tolist()}')

@@ -21,11 +21,13 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from heapq import heapify, heappop, heappush
 import time
 from typing import Any
 
 from mddag_executor.clocks import epoch_offset_ns
+from mddag_executor.core import NEVER
 from mddag_executor.executor.compat import RCL_ERRORS, timer_functions, with_timer_info
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.listeners import NextCall
@@ -39,8 +41,12 @@ from rclpy.exceptions import InvalidHandle
 TOLERANCE_NS = 20_000
 """How far a clock may be off before the offset is measured again (system clocks are slewed)."""
 
-ZERO_PERIOD_NS = 1_000_000
-"""A timer without a period is always due; it runs this often."""
+ZERO_PERIOD_NS = 100_000
+"""
+A timer without a period is always due; it becomes ready at most this often.
+
+Not while it waits: it runs as often as the other callbacks let it.
+"""
 
 Fired = tuple[Work, int, int, int]
 """Execution and nominal due time (monotonic ns) of a timer, the periods missed, the period."""
@@ -121,17 +127,17 @@ class TimerQueue:
     """
     Timers by due time; all methods need one lock.
 
-    :param on_jump: called, from any thread, when the clock of a timer has jumped: call ``fire``
-        soon.
+    :param on_change: called, from any thread, when the clock of a timer has jumped, or a timer is
+        due earlier: call ``fire`` soon.
     :param on_error: receives errors of rcl.
     :ivar has_new: whether there are new due times since it was set to False.
     :ivar has_jumped: whether the clock of a timer has jumped since ``fire``.
     """
 
     def __init__(
-        self, on_jump: Callable[[], None], on_error: Callable[[BaseException], None]
+        self, on_change: Callable[[], None], on_error: Callable[[BaseException], None]
     ) -> None:
-        self._on_jump = on_jump
+        self._on_change = on_change
         self._on_error = on_error
         self._timers: dict[int, TimerSource] = {}
         self._heap: list[tuple[int, int, TimerSource]] = []
@@ -180,7 +186,7 @@ class TimerQueue:
     def _jump(self, _: Any) -> None:
         if not self.has_jumped:
             self.has_jumped = True
-            self._on_jump()
+            self._on_change()
 
     def clear(self) -> None:
         """Forget all timers."""
@@ -190,16 +196,16 @@ class TimerQueue:
     # --- time ------------------------------------------------------------------------------------
 
     def next_due(self) -> int:
-        """Return when to ``fire`` next (monotonic ns); 0: never."""
+        """Return when to ``fire`` next (monotonic ns); NEVER: there are no timers."""
         heap = self._heap
         while heap and heap[0][2].entry != heap[0][1]:
             heappop(heap)
-        return heap[0][0] if heap else 0
+        return heap[0][0] if heap else NEVER
 
     def next_due_of(self, wanted: Callable[[Entity], bool]) -> int:
-        """Return when to ``fire`` next for the wanted timers (monotonic ns); 0: never."""
+        """Return when to ``fire`` next for the wanted timers (monotonic ns), or NEVER."""
         return min((due for due, entry, source in self._heap
-                    if source.entry == entry and wanted(source.entity)), default=0)
+                    if source.entry == entry and wanted(source.entity)), default=NEVER)
 
     def ask(self, source: TimerSource) -> None:
         """Ask rcl when a timer is due that is new or was reset."""
@@ -214,7 +220,7 @@ class TimerQueue:
         if source.simulated:
             source.entry = 0
             if source.is_due():
-                self._push(source, 0)
+                self._push(source, _now())
             return
         due = source.next_due()
         if due is None:
@@ -256,6 +262,9 @@ class TimerQueue:
 
     def _fire(self, source: TimerSource) -> Fired | None:
         """Call a timer if rcl reports it due, and push its next due time."""
+        if source.entity.waiting and source.period() <= 0:
+            source.entity.collect_more = partial(self._fire_again, source)
+            return None
         if source.simulated:  # since the last jump of its clock, which ``fire`` checks first
             return self._fire_simulated(source)
         due, now, until = source.due, _now(), source.until()
@@ -288,9 +297,15 @@ class TimerQueue:
         if not source.is_due():
             return None
         work = source.call()
-        if source.is_due():  # several periods in one jump: rcl has skipped all but the last
-            self._push(source, 0)
+        if source.is_due():  # without a period: rcl skips all but the last of several
+            self._push(source, _now() + ZERO_PERIOD_NS)
         return None if work is None else (work, _now(), 0, 0)
+
+    def _fire_again(self, source: TimerSource) -> None:
+        """Continue with a timer without a period, as its execution has started."""
+        if id(source) in self._timers and not source.entry:
+            self._push(source, _now() + ZERO_PERIOD_NS)
+            self._on_change()
 
     def _failed(self, source: TimerSource, error: Exception) -> None:
         """Classify an exception of rcl: the timer is destroyed or cancelled, or it is an error."""

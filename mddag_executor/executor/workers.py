@@ -276,7 +276,7 @@ class WorkerPool:
         """Let a thread start what waits if a short callback runs longer than expected."""
         guard = self.guard
         if self.engine.idle_workers and not guard.is_set and not (
-                self.polling and 0 < self.loop.timer.at <= now + 2 * GUARD_NS):
+                self.polling and self.loop.timer.at <= now + 2 * GUARD_NS):
             self._guarded = None if self._leader is None else self._leader.work
             guard.set(now + GUARD_NS)
 
@@ -470,7 +470,7 @@ class WorkerPool:
             now = self.now      # a recorded message is later than the turn began
             timers = self.timers
             if (timers.has_new or timers.has_jumped
-                    or 0 < self.loop.timer.at <= now - self._offset):
+                    or self.loop.timer.at <= now - self._offset):
                 if self.running:
                     self.due.handle(now, since or now)
                 self.due.arm(now - self._offset)

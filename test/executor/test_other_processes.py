@@ -7,6 +7,7 @@ import time
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor.executor.announcements import _ENTRY
 from mddag_executor.executor.jobs import (
     Announced,
     header_stamp,
@@ -200,6 +201,13 @@ def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_exe
         doubt.publish(Header(frame_id='2'))
         assert wait_for(lambda: nodes.ran['take'])
         assert executor.statistics()['unattributed'] == {'unknown': 0, 'doubtful': 1}
+        heard = []
+        executor._announcements._note = lambda *entry: heard.append(entry)
+        for wrong in FORGED:
+            noise.publish(forged(executor, **wrong))
+        noise.publish(forged(executor))
+        assert wait_for(lambda: heard)
+        assert len(heard) == 1  # they come in order
         stranger.publish(Header(frame_id='1'))
         assert wait_for(lambda: nodes.ran['two'])
     assert nodes.jobs_of_numbers('take')[2] is None
@@ -207,6 +215,36 @@ def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_exe
     statistics = executor.statistics()
     assert statistics['callbacks']['/two:two']['unattributed'] == 1
     assert statistics['unattributed']['unknown'] == 1
+
+
+def forged(executor, count=1, topic='/left', back=0, dag=0, vertex=1):
+    """Make an announcement as another process sends it, but with a release so long ago."""
+    announcements = executor._announcements
+    number = announcements._number.get(topic, 99)
+    return UInt8MultiArray(data=_ENTRY.pack(
+        7, 9, 1, time.time_ns() - 10**9, time.time_ns() + 10**10, 7, 1, time.monotonic_ns() - back,
+        dag, vertex, number) * count)
+
+
+# The release before the boot of the machine, and others that no executor sends.
+FORGED = (
+    {'back': 10**15}, {'back': -10**15}, {'back': 2**61}, {'vertex': -1}, {'vertex': 99},
+    {'dag': 1}, {'topic': 'another'}, {'count': 257})
+
+
+def test_a_flood_of_announcements_gets_a_small_part_of_the_time(make_executor, make_node):
+    text = GRAPH + 'processes: {p1: [/one], p2: [/two, /three, /four, /five]}'
+    executor = make_executor(loads(text), process='p2')
+    announcements, heard = executor._announcements, []
+    note, announcements._note = announcements._note, lambda *entry: heard.append(note(*entry))
+    message = forged(executor, 256)
+    for _ in range(2000):
+        announcements._hear(message)
+    assert 0 < len(heard) < 2000 * 256 // 2
+    assert 'announcements of jobs are ignored' in executor._pool.deferred.popleft().args[0]
+    assert not executor._pool.deferred
+    before = len(heard)
+    assert wait_for(lambda: announcements._hear(message) or len(heard) > before)
 
 
 # --- the windows of publications, and the numbers of publishers ----------------------------------

@@ -2,9 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timers whose due time changes while the executor waits, and what is due before it spins."""
 
+import os
+import select
+import threading
 import time
 
 from builtin_interfaces.msg import Time as TimeMessage
+from mddag_executor.core import NEVER
+from mddag_executor.executor.listeners import TimerFd
 from msg_graph import loads
 import pytest
 from rclpy.clock import Clock
@@ -23,7 +28,7 @@ MS = 1_000_000
 def waits_for_no_timer(executor):
     """Tell whether the executor knows of all timers, and none is to become due."""
     with executor._pool.lock:
-        return executor._pool.is_current and not executor._pool.timers.next_due()
+        return executor._pool.is_current and executor._pool.timers.next_due() == NEVER
 
 
 def test_a_timer_that_was_cancelled_runs_when_it_is_reset(make_executor, make_node, spinning):
@@ -69,11 +74,11 @@ def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
     place = executor._at_once if sleeps else executor._pool
     (source,) = place.timers._timers.values()
     arrived = list(place.loop.sources(place.loop.wait(0)))
-    assert source in arrived and place.timers.next_due()
+    assert source in arrived and place.timers.next_due() < NEVER
     other.add_node(node)
     for each in arrived:
         each.collect()
-    assert not place.timers.next_due()
+    assert place.timers.next_due() == NEVER
     del kept
 
 
@@ -126,6 +131,51 @@ def test_a_timer_runs_by_simulated_time_and_by_nothing_else(make_executor, make_
         count = len(ran)
         set_clock(3_701_000)
         assert wait_for(lambda: len(ran) > count)
+
+
+@pytest.mark.parametrize('simulated', [False, True])
+def test_a_timer_without_a_period_stops_no_other_timer(make_executor, make_node, simulated):
+    """It is always due, also while simulated time stands still; it waits once at most."""
+    wall, ran, go_on = make_node('wall'), [], threading.Event()
+    node = make_node('node', parameter_overrides=[Parameter('use_sim_time', value=simulated)])
+    publisher = make_node('clock').create_publisher(
+        ClockMessage, '/clock', QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    always, often = [], []
+
+    def run():
+        always.append(1)
+        if len(always) >= 10:
+            go_on.wait()
+
+    timer = node.create_timer(0.0, run)
+    wall.create_timer(0.01, lambda: ran.append(1))
+    wall.create_timer(0.0, lambda: often.append(1), clock=Clock())
+    executor = make_executor(nodes=[node, wall])
+    with Spinning(executor):
+        matched(publisher, count=int(simulated))
+        publisher.publish(ClockMessage(clock=TimeMessage(sec=10)))
+        assert wait_for(lambda: len(always) == 10)
+        before = len(ran), len(often)
+        assert wait_for(lambda: len(ran) >= before[0] + 5 and len(often) > before[1] + 5)
+        entity = next(each for each in executor._registry.timers() if each.rclpy is timer)
+        assert wait_for(lambda: (entity.ready, entity.skipped) == (11, 0))
+        go_on.set()
+        assert wait_for(lambda: len(always) >= 20)
+
+
+def test_any_time_can_be_set_and_never_is_none():
+    """Also one before the boot of the machine; the system call knows none."""
+    timer = TimerFd()
+    try:
+        for at, is_due in ((-1, True), (NEVER, False), (-10**30, True), (0, True), (10**30, False),
+                           (time.monotonic_ns() + 10**12, False), (1, True)):
+            timer.arm(at)
+            assert timer.at == at
+            assert bool(select.select([timer.fd], [], [], 0)[0]) is is_due
+    finally:
+        os.close(timer.fd)
+    with pytest.raises(OSError, match='timerfd_settime'):
+        timer.arm(1)
 
 
 # --- what is due or arrives before it is noticed -------------------------------------------------
