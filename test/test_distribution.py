@@ -74,8 +74,7 @@ def test_works_without_anything_optional(tmp_path):
     ('pyarrow', 'export', [f'export {TRACE} -o out.parquet']),
     ('matplotlib', 'batch', ['evaluate graph.yaml --runs 2 --plot out.png']),
     ('distributed', 'dask', ['evaluate graph.yaml --runs 2 --dask tcp://127.0.0.1:9']),
-    ('rclpy', 'ros', ['run graph.yaml --synthetic sleep', 'top --once',
-                      'graph from-ros -o out.yaml']),
+    ('rclpy', 'ros', ['run graph.yaml --synthetic sleep', 'top --once']),
 ], ids=lambda value: value if isinstance(value, str) else '')
 def test_says_in_one_line_what_is_missing(tmp_path, missing, extra, commands):
     for status, errors in run_without((missing,), commands, tmp_path):

@@ -61,7 +61,6 @@ TASKS = {
         'graph draw': 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)',
         'graph from-trace': 'make a declaration to fill in from a recorded run',
         'graph from-caret': 'make a declaration to fill in from a CARET architecture file',
-        'graph from-ros': 'make a declaration to fill in from the nodes that run now',
         'graph place': 'choose the process of each node, so that the deadlines hold'},
     'Laboratory': {
         'simulate': 'run a declaration in virtual time',
@@ -73,6 +72,11 @@ TASKS = {
         'graph schema': 'print the JSON Schema of declarations, for editors'},
 }
 VERBS = {verb: summary for verbs in TASKS.values() for verb, summary in verbs.items()}
+# What to do instead of a verb that earlier versions had.
+REMOVED = {
+    'graph from-ros': "record the nodes with 'mddag run --node SPEC --trace RUN.mcap' or "
+                      "'ros2 trace', and give the recording to 'mddag graph from-trace'",
+}
 _FAMILIES = {verb.split()[0] for verb in VERBS if ' ' in verb}
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
@@ -113,6 +117,8 @@ def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
     if word.startswith('-'):
         raise UsageError(f'{prog}: {one_line(word)}: options of a verb follow it: '
                          f"see '{prog} --help'")
+    if verb in REMOVED:
+        raise UsageError(f'mddag {verb}: there is no such verb any more: {REMOVED[verb]}')
     if verb not in VERBS:
         known = (each.removeprefix(f'{family} ') for each in VERBS)
         raise unknown(prog, 'verb', word, [each for each in known if ' ' not in each]

@@ -102,7 +102,7 @@ def test_bad_input(files, call):
 
 
 @pytest.mark.parametrize('command', [
-    'top --once', 'graph from-ros', 'run g.yaml --synthetic sleep'])
+    'top --once', 'run g.yaml --synthetic sleep'])
 def test_where_rclpy_cannot_write_its_log_one_line_says_so(files, mddag, monkeypatch, command):
     monkeypatch.setenv('ROS_LOG_DIR', '/proc/none')
     done = mddag(*command.split())

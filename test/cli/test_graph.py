@@ -121,13 +121,6 @@ def test_from_trace(call, tmp_path):
     assert {each['kind'] for each in found} == {'rate'}
 
 
-def test_from_ros_where_nothing_runs(mddag, tmp_path):
-    done = mddag('graph', 'from-ros', '--timeout', '0.3', '-o', 'g.yaml', cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith('error: ROS graph: no node ')
-    assert not (tmp_path / 'g.yaml').exists()
-
-
 def test_a_trace_holds_what_its_declaration_includes(call, tmp_path):
     (tmp_path / 'part.yaml').write_text(
         'mddag: 1\narguments:\n  d:\nnodes:\n  - {node: /n, callbacks: '

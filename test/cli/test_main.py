@@ -148,7 +148,7 @@ def test_completion(tmp_path):
         return set(out.read_text().split())
 
     assert completed('mddag expl') == {'explain'}
-    assert completed('mddag graph from-') == {'from-trace', 'from-ros', 'from-caret'}
+    assert completed('mddag graph from-') == {'from-trace', 'from-caret'}
     assert completed('mddag graph place g.yaml --pro') == {'--processes'}
 
 
