@@ -58,7 +58,7 @@ def run_without(missing, commands, folder):
 
 def test_works_without_anything_optional(tmp_path):
     commands = [
-        'graph check graph.yaml', 'graph analyse graph.yaml', 'graph schema',
+        'graph check graph.yaml', 'graph schema',
         'graph draw graph.yaml -o out.mmd',
         'simulate graph.yaml --duration 100ms --trace out.mcap',
         'evaluate graph.yaml --runs 2 --duration 50ms --policies rad',

@@ -4,13 +4,14 @@
 The verb `graph check`: validate a declaration and show the DAG tasks that it gives.
 
 Critical path, load and utilisation are those of the mean execution times. They are unknown (`-`,
-in JSON null) if an execution time is not declared.
+in JSON null) if an execution time is not declared, and then the tests are left out.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor import defaults
@@ -23,14 +24,17 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag graph check config/autoware.yaml
-mddag graph check config/autoware.yaml --json -
+mddag graph check config/autoware.yaml --budget p99 --workers 4 --json -
+mddag graph check graph.yaml --fail-on-unschedulable
 """
 DESCRIPTION = """\
 Validate a declaration and show the DAG tasks that it gives: period, number of vertices, sinks with
 deadlines, critical path and load in cores, the last two with the mean execution times (- if one
-is not declared). The utilisation is the load of all DAGs divided by the workers. A path that takes
-longer than its deadline, and a load that the workers or CPUs cannot do, are warned of; to fail
-then, use `mddag graph analyse --fail-on-unschedulable`."""
+is not declared). The utilisation is the load of all DAGs divided by the workers.
+
+If all execution times are declared, three tests follow. If one fails, no scheduler can keep the
+deadlines, and a warning says so. If all hold, the deadlines can still be missed: the tests include
+no overheads, callback groups or Python's lock."""
 
 _HEADER = ('DAG', 'period', 'vertices', 'critical path', 'load', 'sink', 'deadline')
 
@@ -39,28 +43,41 @@ _BACKLOG_LOAD = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    options.add(parser, 'graph', '--json')
+    options.add(parser, 'graph', '--workers', '--json')
+    parser.add_argument(
+        '--budget', choices=defaults.BUDGETS, default='mean',
+        help='what of each execution time the tests count: its maximum, 99 %% quantile or mean '
+        '(default)')
+    parser.add_argument(
+        '--fail-on-unschedulable', action='store_true',
+        help='exit with status 1 if a test fails, and 2 if an execution time is not declared')
 
 
 def main(args: argparse.Namespace) -> int:
     task_set = common.load_graph(args.graph)
-    result = check_result(task_set)
+    workers = defaults.workers(args.workers, task_set)
+    result = check_result(task_set, workers, args.budget)
+    if args.fail_on_unschedulable:
+        from mddag_executor.simulate.workload import check_execution_times
+        check_execution_times(task_set)
+    tests = result['tests']
     warn(*_warnings(task_set, result))
     common.show(args, result, (
-        table(_HEADER, _rows(result), grouped=5), _summary(task_set, result)))
-    return 0
+        table(_HEADER, _rows(result), grouped=5), *_tests(result), _summary(task_set, result)))
+    return int(args.fail_on_unschedulable and not all(test['holds'] for test in tests))
 
 
-def check_result(task_set: TaskSet) -> dict[str, Any]:
+def check_result(task_set: TaskSet, workers: int, budget: str) -> dict[str, Any]:
     """
     Return the result of `graph check` for machines.
 
     Times are in ns; `rad_offset_ns` is the reference absolute deadline (RAD) minus the release of
     each vertex, in the order of `vertices`. `load` is in cores, `utilisation` is load divided by
-    `workers`. They and `critical_path_ns` are None if an execution time is not declared.
+    `workers`. They and `critical_path_ns` are None if an execution time is not declared; `tests`
+    is empty then.
     """
     from mddag_executor.core import Tables
-    workers = defaults.workers(None, task_set)
+    from mddag_executor.laboratory.necessary import necessary_tests
     tables = Tables.build(task_set)
     dags = {}
     for dag in task_set.dags:
@@ -76,6 +93,9 @@ def check_result(task_set: TaskSet) -> dict[str, Any]:
         'workers': workers,
         'load': load,
         'utilisation': None if load is None else load / workers,
+        'budget': budget,
+        'tests': [] if load is None or not task_set.dags else [
+            asdict(verdict) for verdict in necessary_tests(task_set, workers, budget)],
         'queue_edges': [
             {'reader': edge.reader, 'topic': edge.topic, 'writers': list(edge.writers)}
             for edge in task_set.queue_edges],
@@ -110,21 +130,22 @@ def _backlog(dag: Dag, load: float | None) -> Iterator[str]:
 
 
 def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
-    from msg_graph.model import mean_execution_times, path_lengths
+    for test in result['tests']:
+        if test['holds']:
+            continue
+        if test['test'] != 'longest path':
+            yield (f'{task_set.file}: {test["test"]}: {test["figure"]}: {test["reason"]}: '
+                   'no scheduler can keep the deadlines then')
+            continue
+        for sink, times in test['details'].items():
+            length, deadline = times['longest_path_ns'], times['deadline_ns']
+            if length > deadline:
+                yield (f'{sink}: the longest path to it takes {format_ns(length)}, more than its '
+                       f'deadline of {format_ns(deadline)}: no scheduler can keep it')
     for dag in task_set.dags:
-        means = mean_execution_times(dag)
-        lengths = [] if means is None else path_lengths(dag, means)
-        for length, vertex in zip(lengths, dag.vertices):
-            if vertex.deadline_ns is not None and length > vertex.deadline_ns:
-                yield (f'{vertex.name}: the longest path to it takes {format_ns(length)}, more '
-                       f'than its deadline of {format_ns(vertex.deadline_ns)}: no scheduler can '
-                       'keep it')
         yield from _backlog(dag, result['dags'][dag.name]['load'])
-    load, workers, cpus = result['load'], result['workers'], defaults.processors()
-    if load is not None and load > workers:
-        yield (f'{task_set.file}: a load of {load:.3f} is more than '
-               f'{counted(workers, "worker")} can do: no scheduler can keep the deadlines')
-    elif load is not None and load > cpus:
+    load, cpus = result['load'], defaults.processors()
+    if load is not None and cpus < load <= result['workers']:
         yield (f'{task_set.file}: a load of {load:.3f} is more than the {counted(cpus, "CPU")} of '
                'this machine can do, unless callbacks wait instead of computing')
 
@@ -140,6 +161,14 @@ def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
             None if load is None else f'{load:.4f}']
         for sink, deadline in dag['sinks'].items():
             yield [*of_dag, short[sink], format_ns(deadline)]
+
+
+def _tests(result: dict[str, Any]) -> Iterator[str]:
+    if result['tests']:
+        yield table(
+            ('test', 'verdict', f'figure ({result["budget"]} execution times)'),
+            ((test['test'], 'holds' if test['holds'] else 'fails', test['figure'])
+             for test in result['tests']))
 
 
 def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:

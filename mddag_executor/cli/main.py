@@ -57,7 +57,7 @@ TASKS = {
         'export': 'turn a recording into files for Perfetto or for data frames',
         'import ctf': 'turn a CARET or ros2_tracing recording (LTTng) into a trace'},
     'Plan': {
-        'graph check': 'validate a declaration and show its DAGs',
+        'graph check': 'validate a declaration, show its DAGs and whether the deadlines can hold',
         'graph draw': 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)',
         'graph from-trace': 'make a declaration to fill in from a recorded run',
         'graph from-caret': 'make a declaration to fill in from a CARET architecture file',
@@ -66,7 +66,6 @@ TASKS = {
         'simulate': 'run a declaration in virtual time',
         'evaluate': 'measure acceptance ratios over many simulated runs',
         'generate': 'make random multi-deadline, multi-rate DAG sets',
-        'graph analyse': 'test whether the deadlines can hold, before the first run',
         'graph assign-deadlines': 'give the sinks deadlines, by critical path or by search'},
     'Develop': {
         'graph schema': 'print the JSON Schema of declarations, for editors'},
@@ -74,6 +73,7 @@ TASKS = {
 VERBS = {verb: summary for verbs in TASKS.values() for verb, summary in verbs.items()}
 # What to do instead of a verb that earlier versions had.
 REMOVED = {
+    'graph analyse': "'mddag graph check' tests whether the deadlines can hold",
     'graph from-ros': "record the nodes with 'mddag run --node SPEC --trace RUN.mcap' or "
                       "'ros2 trace', and give the recording to 'mddag graph from-trace'",
 }

@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mddag_executor import defaults
-from mddag_executor.core import Tables
 from mddag_executor.errors import UsageError
 from mddag_executor.simulate.workload import check_execution_times
 from msg_graph import Dag, ExecutionTime, TaskSet
@@ -20,22 +19,18 @@ class Task:
     A DAG task with a budget for each vertex; all times in ns, vertices by their index.
 
     :ivar costs: the budgets.
-    :ivar rad: RAD minus release.
     :ivar latest: when a vertex must be done, after the release, so that its successors can be.
     :ivar sinks: index, relative deadline and length of the longest path, of each sink.
     :ivar volume: sum of the budgets.
     :ivar length: the longest path of all.
-    :ivar deadline: the latest relative deadline.
     """
 
     dag: Dag
     costs: tuple[int, ...]
-    rad: tuple[int, ...]
     latest: tuple[int, ...]
     sinks: tuple[tuple[int, int, int], ...]
     volume: int
     length: int
-    deadline: int
 
     @property
     def period(self) -> int:
@@ -54,19 +49,16 @@ def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
         raise UsageError(f"budget '{budget}': there is no such budget: choose one of "
                          f'{", ".join(defaults.BUDGETS)}')
     check_execution_times(task_set)
-    tables = Tables.build(task_set)
     tasks = []
     for dag in task_set.dags:
-        first = tables.first_vertex[dag.index]
         costs = [_budget(vertex.callback.execution_time, budget)  # type: ignore[arg-type]
                  for vertex in dag.vertices]
         lengths = path_lengths(dag, costs)
         sinks = tuple((i, dag.vertices[i].deadline_ns or 0, lengths[i]) for i in dag.sinks)
         tasks.append(Task(
             dag=dag, costs=tuple(costs),
-            rad=tuple(tables.rad_offset[first:first + len(dag.vertices)]),
             latest=tuple(_latest(dag, costs)), sinks=sinks, volume=sum(costs),
-            length=max(lengths), deadline=max(deadline for _, deadline, _ in sinks)))
+            length=max(lengths)))
     return tasks
 
 

@@ -31,11 +31,9 @@ COMMANDS = {
         'graph check - < ROOT/config/reference_system.yaml'),
     'check_warnings': '; '.join(f'graph check {name}.yaml' for name in (
         'hopeless', 'overloaded', 'many_workers', 'timed')),
-    'analyse': 'graph analyse graph.yaml --budget mean',
-    'analyse_status': (
-        'graph analyse graph.yaml --fail-on-unschedulable; '
-        'graph analyse timed.yaml --fail-on-unschedulable; graph analyse late.yaml'),
-    'analyse_json': 'graph analyse graph.yaml --json -',
+    'check_status': (
+        'graph check graph.yaml --fail-on-unschedulable -q; '
+        'graph check timed.yaml --fail-on-unschedulable --budget max --workers 3'),
     'assign': 'graph assign-deadlines graph.yaml --runs 20 -o out.yaml',
     'assign_target': (
         'graph assign-deadlines graph.yaml --target 0.8 --runs 40 --duration 100ms '

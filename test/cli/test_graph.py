@@ -22,7 +22,7 @@ def test_utilisation_is_one_thing_in_all_commands(call, tmp_path):
         'mddag: 1\nworkers: 2\nnodes:\n  - node: /n\n    callbacks:\n'
         '      - {name: t, timer: 10ms, deadline: 10ms, execution_time: 4ms}\n')
     for command in (
-            'graph check g.yaml', 'graph analyse g.yaml',
+            'graph check g.yaml',
             'simulate g.yaml --duration 1s --trace g.mcap', 'replay g.mcap',
             'replay g.mcap --reschedule'):
         result = call(*command.split(), '--json', '-', cwd=tmp_path).result

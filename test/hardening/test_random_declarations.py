@@ -34,7 +34,7 @@ MORE = {
     'release_from': st.sampled_from(['arrival', 'header_stamp', 'source_timestamp']),
     'group': st.sampled_from(['g', 'h', 'reentrant'])}
 VERBS = (
-    ('graph', 'check'), ('graph', 'analyse'),
+    ('graph', 'check'), ('graph', 'check', '--budget', 'max', '--fail-on-unschedulable'),
     ('graph', 'draw', '-o', 'out.mmd'), ('graph', 'draw', '-o', 'out.dot'),
     ('graph', 'assign-deadlines', '--runs', '2', '--duration', '300us', '-o', 'out.yaml'),
     ('simulate', '--duration', '300us', '--workers', '2'),
