@@ -61,7 +61,7 @@ TASKS = {
         'graph draw': 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)',
         'graph from-trace': 'make a declaration to fill in from a recorded run',
         'graph from-caret': 'make a declaration to fill in from a CARET architecture file',
-        'graph place': 'choose the process of each node, so that the deadlines hold'},
+        'graph place': 'pack the nodes into processes, so that each needs Python little'},
     'Laboratory': {
         'simulate': 'run a declaration in virtual time',
         'evaluate': 'measure acceptance ratios over many simulated runs',

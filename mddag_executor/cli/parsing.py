@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from types import ModuleType
 from typing import NoReturn
@@ -20,6 +20,8 @@ class Parser(argparse.ArgumentParser):
     """An argument parser that reports a wrong command line as a `UsageError`."""
 
     _words: Sequence[str] = ()
+    removed_options: Mapping[str, str] = {}
+    """What to do instead of an option that earlier versions had."""
 
     def parse(self, words: Sequence[str]) -> argparse.Namespace:
         """Parse options and other arguments, in any order up to `--`."""
@@ -32,6 +34,9 @@ class Parser(argparse.ArgumentParser):
         """Raise instead of printing the usage and exiting."""
         for word in takewhile(lambda each: each not in _REST, self._words):
             name = word.partition('=')[0] if word.startswith('--') else word[:2]
+            if name in self.removed_options:
+                raise UsageError(f'{self.prog}: there is no option {name} any more: '
+                                 f'{self.removed_options[name]}')
             if _is_option(name) and name not in self._option_string_actions:
                 raise unknown(self.prog, 'option', name, self._option_string_actions)
         raise UsageError(f"{self.prog}: {message}: see '{self.prog} --help'")
@@ -53,14 +58,15 @@ def verb_parser(prog: str, module: ModuleType, summary: str) -> Parser:
     Return the parser of a verb.
 
     :param prog: the command up to the verb
-    :param module: has `EXAMPLE`, `add_arguments`, perhaps `DESCRIPTION`, and `main`, which becomes
-        `args.main`
+    :param module: has `EXAMPLE`, `add_arguments`, perhaps `DESCRIPTION` and `REMOVED_OPTIONS`, and
+        `main`, which becomes `args.main`
     """
     parser = Parser(
         prog=prog, allow_abbrev=False,
         description=getattr(module, 'DESCRIPTION', f'{summary[:1].upper()}{summary[1:]}.'),
         epilog='\n  '.join(('example:', *module.EXAMPLE.strip().splitlines())),
         formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.removed_options = getattr(module, 'REMOVED_OPTIONS', {})
     module.add_arguments(parser)
     parser.add_argument('-q', '--quiet', action='store_true',
                         help='no tables, warnings and progress: only errors and written files')

@@ -18,7 +18,6 @@ A process computes Python on one core, so its interpreter bounds its load.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 
@@ -36,37 +35,22 @@ class Placing:
 
     :param execution_ns: the execution time of each vertex, by DAG and local index.
     :param together: nodes that run in one process, group by group.
-    :param apart: nodes of which no two run in one process, group by group.
-    :raises UsageError: when a node is not declared, or is to be together with and apart from one.
+    :raises UsageError: if there are more processes than nodes, or groups of nodes.
     """
 
     def __init__(
         self, task_set: TaskSet, n_processes: int, execution_ns: Sequence[Sequence[int]],
-        together: Iterable[Sequence[str]] = (), apart: Iterable[Sequence[str]] = (),
+        together: Iterable[Sequence[str]] = (),
     ) -> None:
         self._task_set = task_set
         self._n = n_processes
         self.nodes = list(dict.fromkeys(callback.node for callback in task_set.callbacks))
         self._block = {node: i for i, node in enumerate(self.nodes)}
         for group in (*together, *self._publishers()):
-            self._check(group)
             joined = {self._block[node] for node in group}
             for node, block in self._block.items():
                 if block in joined:
                     self._block[node] = min(joined)
-        self._apart: set[tuple[int, int]] = set()
-        for group in apart:
-            self._check(group)
-            if len(set(group)) > n_processes:
-                raise UsageError(
-                    f'--apart {",".join(group)}: these are {len(set(group))} nodes for '
-                    f'{counted(n_processes, "process", "processes")}: give more processes')
-            for one, other in combinations(group, 2):
-                pair = self._block[one], self._block[other]
-                if pair[0] == pair[1]:
-                    raise UsageError(f'--apart {one},{other}: they are to run together, too: '
-                                     'leave out one of both')
-                self._apart |= {pair, pair[::-1]}
         self._blocks = sorted(set(self._block.values()))
         if n_processes > len(self._blocks):
             raise UsageError(
@@ -83,12 +67,6 @@ class Placing:
             for topic in callback.publishes:
                 by_topic.setdefault(topic, []).append(callback.node)
         return list(by_topic.values())
-
-    def _check(self, group: Iterable[str]) -> None:
-        for node in group:
-            if node not in self._block:
-                raise UsageError(f"node '{node}': {self._task_set.file} does not declare it: name "
-                                 'one of its nodes')
 
     def _measure(self, execution_ns: Sequence[Sequence[int]]) -> None:
         """Sum up what blocks compute, and what passes between two of them (rules 1 and 2)."""
@@ -118,66 +96,33 @@ class Placing:
         return loads
 
     def place(self) -> dict[int, int]:
-        """Return the process of each block (rule 3); UsageError: too many are to run apart."""
-        torn = Counter(block for block, _ in self._apart)
-        order = sorted(self._blocks, key=lambda b: (-torn[b], -self._own[b], b))
-        place = self._kept_apart({}, order[:len(torn)])
-        if place is None:
-            raise UsageError(f'--apart: {counted(self._n, "process", "processes")} cannot '
-                             'keep all these nodes apart: give more processes')
-        for block in order[len(torn):]:
+        """Return the process of each block (rule 3)."""
+        place: dict[int, int] = {}
+        for block in sorted(self._blocks, key=lambda b: (-self._own[b], b)):
             left = len(self._blocks) - len(place)
             empty = [p for p in range(self._n) if p not in place.values()]
-            place[block] = self._best(place, block, empty if left <= len(empty) else range(
-                self._n))[0]
+            choice = empty if left <= len(empty) else range(self._n)
+            # of equal ones the process with fewer blocks
+            place[block] = min(choice, key=lambda p: (
+                self._cost({**place, block: p}), sum(q == p for q in place.values()), p))
         better: dict[int, int] | None = place
         while better is not None:
             place, cost = better, self._cost(better)
-            better = next((p for p in self.neighbours(place) if self._cost(p) < cost), None)
+            better = next((p for p in self._neighbours(place) if self._cost(p) < cost), None)
         return place
-
-    def _best(self, place: dict[int, int], block: int, choice: Iterable[int]) -> list[int]:
-        """Return processes for a block, the best first; of equal ones that with fewer blocks."""
-        return sorted(choice, key=lambda p: (
-            self._cost({**place, block: p}), sum(q == p for q in place.values()), p))
-
-    def _kept_apart(self, place: dict[int, int], blocks: list[int]) -> dict[int, int] | None:
-        """Return a placement with more blocks, None where they cannot be kept apart."""
-        if not blocks:
-            return place
-        empty = [p for p in range(self._n) if p not in place.values()]
-        # one empty process is as good as another: all would fail alike
-        allowed = [p for p in range(self._n)
-                   if self._fits(place, blocks[0], p) and p not in empty[1:]]
-        return next((found for p in self._best(place, blocks[0], allowed) if (
-            found := self._kept_apart({**place, blocks[0]: p}, blocks[1:])) is not None), None)
-
-    def _fits(self, place: dict[int, int], block: int, process: int) -> bool:
-        return all((block, other) not in self._apart
-                   for other, where in place.items() if where == process)
 
     def _cost(self, place: dict[int, int]) -> tuple[float, float]:
         loads = self.loads(place)
         return round(max(loads), 9), round(sum(loads), 9)
 
-    def neighbours(self, place: dict[int, int]) -> Iterator[dict[int, int]]:
-        """Yield the allowed placements that differ in one block, or in two exchanged ones."""
-        for block in self._blocks:
-            for process in range(self._n):
-                if process != place[block]:
-                    yield from self._allowed({**place, block: process}, (block,))
+    def _neighbours(self, place: dict[int, int]) -> Iterator[dict[int, int]]:
+        """Yield the placements that differ in one block, or in two exchanged ones."""
+        moved = ({**place, block: process} for block in self._blocks
+                 for process in range(self._n) if process != place[block])
+        yield from (each for each in moved if len(set(each.values())) == self._n)
         for one, other in combinations(self._blocks, 2):
             if place[one] != place[other]:
-                yield from self._allowed(
-                    {**place, one: place[other], other: place[one]}, (one, other))
-
-    def _allowed(
-        self, place: dict[int, int], changed: tuple[int, ...]
-    ) -> Iterator[dict[int, int]]:
-        others = {b: p for b, p in place.items() if b not in changed}
-        if len(set(place.values())) == self._n and all(
-                self._fits(others, block, place[block]) for block in changed):
-            yield place
+                yield {**place, one: place[other], other: place[one]}
 
     def processes(self, place: dict[int, int]) -> tuple[Process, ...]:
         """Return the processes of a placement, ``p1`` with the node that is declared first."""

@@ -38,17 +38,9 @@ COMMANDS = {
     'assign_target': (
         'graph assign-deadlines graph.yaml --target 0.8 --runs 40 --duration 100ms '
         '--json out.json'),
-    'place': 'graph place graph.yaml --processes 2 --cpus 2 --duration 200ms -o out.yaml',
-    'place_json': (
-        'graph place graph.yaml --processes 2 --cpus 2 --duration 200ms --json - -o out.yaml'),
-    'place_rules': (
-        'graph place graph.yaml --processes 2 --together /camera,/wheels --duration 200ms -o -; '
-        'graph place graph.yaml --processes 2 --apart /camera,/detector --duration 200ms '
-        '-q -o out.yaml'),
-    'place_trace': (
-        'simulate graph.yaml --execution-times times.json --trace own.mcap --duration 1s -q; '
-        'graph place graph.yaml --processes 2 --trace own.mcap --duration 200ms '
-        '-o out.yaml'),
+    'place': 'graph place graph.yaml --processes 2 -o out.yaml',
+    'place_json': 'graph place graph.yaml --processes 2 --json - -o out.yaml',
+    'place_trace': 'graph place graph.yaml --processes 2 --trace own.mcap -o -',
     'generate': 'generate --dags 2 --vertices 3:5 --sinks 2 --or-share 0.5 --seed 4',
     'simulate': 'simulate graph.yaml --duration 200ms',
     'simulate_options': '; '.join(f'simulate graph.yaml --duration 200ms {how}' for how in (
