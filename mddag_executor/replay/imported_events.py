@@ -16,38 +16,35 @@ from typing import Any, NamedTuple
 from mddag_executor.recording.tables import different, Ints, sort_by, Table
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
+from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.events import Event
+from mddag_executor.trace.schema import (
+    BEFORE_HUMBLE,
+    BEFORE_HUMBLE_PROBLEM,
+    BEFORE_HUMBLE_REMEDY,
+)
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
 ADDRESSES = 2 ** 64
 
-(START, END, INTRA, RCLCPP, RCL, DDS_WRITE, BECAME, BIND, RMW_PUBLISH, WRITE_PRE, WRITTEN,
- DISPATCH, TAKE_ERASED, DISPATCH_ERASED, TAKE, WITHIN, COPY, ENQUEUE, DEQUEUE, LOST, READY,
- SHUTDOWN) = range(22)
+(START, END, INTRA, RCLCPP, RCL, DDS_WRITE, BECAME, BIND, RMW_PUBLISH, DISPATCH, TAKE, WITHIN,
+ COPY, ENQUEUE, DEQUEUE, LOST, READY, SHUTDOWN) = range(18)
 
-_CARET = {
-    'dds_write': (DDS_WRITE, 'message message_addr', 'timestamp_'),
-    'dds_bind_addr_to_addr': (BECAME, 'addr_from', 'addr_to'),
-    'dds_bind_addr_to_stamp': (BIND, 'addr addr_from', 'source_stamp stamp_to')}
 KINDS: dict[str, tuple[Any, ...]] = {
-    **{f'{provider}:{name}': kind for name, kind in _CARET.items()
-       for provider in ('ros2_caret', 'ros2_hook')},
+    'ros2_caret:dds_write': (DDS_WRITE, 'message', 'timestamp_'),
+    'ros2_caret:dds_bind_addr_to_addr': (BECAME, 'addr_from', 'addr_to'),
+    'ros2_caret:dds_bind_addr_to_stamp': (BIND, 'addr', 'source_stamp'),
     'ros2:callback_start': (START, 'callback'),
     'ros2:callback_end': (END, 'callback'),
     'ros2:rclcpp_intra_publish': (INTRA, 'publisher_handle', 'message'),
     'ros2:rclcpp_publish': (RCLCPP, 'publisher_handle', 'message'),
     'ros2:rcl_publish': (RCL, 'publisher_handle', 'message'),
     'ros2:rmw_publish': (RMW_PUBLISH, 'message', 'timestamp_ source_timestamp'),
-    'dds:write_pre': (WRITE_PRE, 'data'),
-    'dds:write': (WRITTEN, '', 'timestamp_'),
     'ros2:dispatch_subscription_callback': (
         DISPATCH, 'callback', 'source_stamp', 'message_timestamp'),
-    'ros2_hook:take_type_erased': (TAKE_ERASED, 'message', 'source_stamp'),
-    'ros2:dispatch': (DISPATCH_ERASED, 'callback', 'message'),
     'ros2:rmw_take': (TAKE, 'rmw_subscription_handle', 'source_timestamp', 'taken'),
     'ros2:dispatch_intra_process_subscription_callback': (WITHIN, 'callback', 'message'),
-    'ros2:dispatch_intra_process': (WITHIN, 'callback', 'message'),
     'ros2:message_construct': (COPY, 'original_message', 'constructed_message'),
     'ros2:rclcpp_ring_buffer_enqueue': (ENQUEUE, 'buffer', 'index', 'overwritten'),
     'ros2:rclcpp_ring_buffer_dequeue': (DEQUEUE, 'buffer', 'index'),
@@ -86,8 +83,10 @@ def read_events(
     parts: list[Table] = [np.zeros(0, _EVENT)]
     tuples: list[tuple[int, Event]] = []
     count = 0
-    for batch in reader.batches({*kinds, *others}, as_table=False):
+    for batch in reader.batches({*kinds, *others, *BEFORE_HUMBLE}, as_table=False):
         for head, rows, places in batch.tables:
+            if head[0].name in BEFORE_HUMBLE:
+                raise TraceError(reader.path, BEFORE_HUMBLE_PROBLEM, BEFORE_HUMBLE_REMEDY)
             if head[0].name in kinds:
                 parts.append(_normal(rows, places, kinds[head[0].name]))
             if head[0].name not in kinds or head[0].name in others:

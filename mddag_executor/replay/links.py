@@ -23,19 +23,14 @@ before another one in the same thread.
    * CARET, Fast DDS from Humble on: `dds_bind_addr_to_stamp` of address 0, which means the
      thread's last publication,
    * CARET from Jazzy on: `dds_write`,
-   * ros2_tracing from Jazzy on: `rmw_publish`; before, with an instrumented Cyclone DDS:
-     `dds:write_pre` of the message's address, then `dds:write`.
+   * ros2_tracing from Jazzy on: `rmw_publish`.
 
-   Until September 2021 CARET's events were named `ros2_hook`, with other names of some fields.
 3. *Messages between processes*: `dispatch_subscription_callback` (Galactic, Humble) has the
    callback and the source timestamp; later formats have `rmw_take` before the `callback_start` in
-   the same thread.  In August 2021 `dispatch` had the callback and the message's address, and
-   `take_type_erased`, before it in the same thread, the address and the source timestamp.  The
-   publication is the one on the same topic with the same source timestamp.
+   the same thread.  The publication is the one on the same topic with the same source timestamp.
 4. *Messages within a process*: in Humble by the message's address, followed through copies
-   (`message_construct`) to `dispatch_intra_process_subscription_callback` (August 2021:
-   `dispatch_intra_process`); from Iron on by buffer and index of the ring buffer
-   (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
+   (`message_construct`) to `dispatch_intra_process_subscription_callback`; from Iron on by buffer
+   and index of the ring buffer (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
 5. `rmw_take` inside an execution: the callback itself took the message (a queue edge).
 6. Events that don't match (ends without starts, starts without ends, messages without publication,
    publishers without tracepoint) are counted by callback or topic.
@@ -66,7 +61,6 @@ from mddag_executor.replay.imported_events import (
     DDS_WRITE,
     DEQUEUE,
     DISPATCH,
-    DISPATCH_ERASED,
     END,
     ENQUEUE,
     Events,
@@ -78,10 +72,7 @@ from mddag_executor.replay.imported_events import (
     RMW_PUBLISH,
     START,
     TAKE,
-    TAKE_ERASED,
     WITHIN,
-    WRITE_PRE,
-    WRITTEN,
 )
 from mddag_executor.text import counted, listed
 import numpy as np
@@ -89,8 +80,8 @@ import numpy as np
 _DEEPEST = 32
 _NONE, _SEVERAL = -1, -2      # instead of a publication
 _PUBLISHES = (INTRA, RCLCPP, RCL)
-_STAMPS = (DDS_WRITE, BIND, RMW_PUBLISH, WRITTEN)
-_ARRIVALS = (DISPATCH, DISPATCH_ERASED, TAKE, WITHIN, DEQUEUE, READY)
+_STAMPS = (DDS_WRITE, BIND, RMW_PUBLISH)
+_ARRIVALS = (DISPATCH, TAKE, WITHIN, DEQUEUE, READY)
 
 _SAID = {
     'ends': ('execution', 'without an end in it (the event was lost)'),
@@ -179,7 +170,7 @@ class Links:
         # by thread, then by time
         self._order = sort_by(self.events['thread'])
         self.callbacks, self._callback = self._objects(
-            np.isin(kind, (START, END, DISPATCH, DISPATCH_ERASED, WITHIN, READY)),
+            np.isin(kind, (START, END, DISPATCH, WITHIN, READY)),
             who.callbacks, who.callback)
         self.publishers, self._publisher = self._objects(
             np.isin(kind, _PUBLISHES) & (self.events['a'] != 0), who.publishers)
@@ -371,17 +362,12 @@ class Links:
         table, found = self.events, self.messages
         kind, a = table['kind'], table['a']
         publishes = np.isin(kind, _PUBLISHES)
-        about = np.isin(kind, (*_STAMPS, BECAME, WRITE_PRE))
+        about = np.isin(kind, (*_STAMPS, BECAME))
         # by event: the last one of a publication, unless a callback began or ended after it
         last = np.full(len(table), -1)
         last[about] = self._last(publishes | (kind <= END), about)
         last[about & (kind[np.maximum(last, 0)] <= END)] = -1
         message = table['b'][np.maximum(last, 0)]
-        # the write of another publication: what follows is not of this one
-        other = (kind == WRITE_PRE) & (last >= 0) & (a != message)
-        wrote = np.full(len(table), -1)
-        wrote[about] = self._last(publishes | (kind <= END) | other, about)
-        last[about & (wrote >= 0) & other[np.maximum(wrote, 0)]] = -1
         became = (kind == BECAME) & (last >= 0) & (a == message)
         form = np.full(len(table), -1)
         form[about] = self._last(publishes | (kind <= END) | became, about)
@@ -409,14 +395,6 @@ class Links:
         arrives = np.isin(kind, _ARRIVALS)
         taken = (kind == TAKE) & (self.events['c'] != 0) & (self.events['b'] != 0)
         arrives &= (kind != TAKE) | taken
-        erased = kind == DISPATCH_ERASED
-        if erased.any():
-            before = self._last(erased | (kind == TAKE_ERASED), erased)
-            good = (before >= 0) & (kind[before] == TAKE_ERASED) & (
-                self.events['a'][before] == self.events['b'][erased])
-            at = np.flatnonzero(erased)     # otherwise its `take_type_erased` was lost
-            arrives[at[~good]] = False
-            self.events['c'][at[good]] = before[good]
         starts = kind == START
         last = self._last(arrives | starts, starts)
         found: Ints = np.where((last >= 0) & arrives[np.maximum(last, 0)], last, -1)
@@ -445,10 +423,9 @@ class Links:
             kind == TAKE, self._may_take(at, number),
             (kind == DEQUEUE) | (self._callback[at] == number))
         rows, at, kind = rows[fits], at[fits], kind[fits]
-        source = np.where(kind == DISPATCH_ERASED, table['c'][at], at)
-        runs['taken'][rows] = table['time'][source]
-        by_stamp = np.isin(kind, (DISPATCH, DISPATCH_ERASED, TAKE))
-        runs['stamp'][rows[by_stamp]] = table['b'][source[by_stamp]]
+        runs['taken'][rows] = table['time'][at]
+        by_stamp = np.isin(kind, (DISPATCH, TAKE))
+        runs['stamp'][rows[by_stamp]] = table['b'][at[by_stamp]]
         stated = kind == DISPATCH
         runs['stated'][rows[stated]] = table['c'][at[stated]]
         runs['message'][rows[~by_stamp]] = [within.get(e, -1) for e in at[~by_stamp].tolist()]

@@ -52,7 +52,14 @@ from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.ctf_helper import PATIENCE_S
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.numbers import Numbers
-from mddag_executor.trace.schema import EVENTS, EventType, PREAMBLE
+from mddag_executor.trace.schema import (
+    BEFORE_HUMBLE,
+    BEFORE_HUMBLE_PROBLEM,
+    BEFORE_HUMBLE_REMEDY,
+    EVENTS,
+    EventType,
+    PREAMBLE,
+)
 from mddag_executor.trace.trace_file import TraceFile, whole_trace
 
 INSTALL = 'apt install python3-bt2'
@@ -449,6 +456,8 @@ class _Importer:
             provider, name = 'ctf', original
         key = f'{_legal(provider)}:{_legal(name)}'
         self._names.add(key)
+        if key in BEFORE_HUMBLE:
+            raise TraceError(self._path, BEFORE_HUMBLE_PROBLEM, BEFORE_HUMBLE_REMEDY)
         event, converts = event_type(key, fields)
         self._kinds[number] = self._file.define(event), converts if any(converts) else [], trace
 

@@ -18,6 +18,11 @@ from mddag_executor.trace.cdr import FieldType
 
 PREAMBLE = (('timestamp', 'int64'), ('vpid', 'int32'), ('vtid', 'int32'))
 
+BEFORE_HUMBLE = ('ros2_hook:dds_write', 'ros2_hook:take_type_erased', 'dds:write_pre')
+"""Events of CARET and of an instrumented Cyclone DDS that only recordings before Humble have."""
+BEFORE_HUMBLE_PROBLEM = 'it was recorded before ROS 2 Humble, which is not read any more'
+BEFORE_HUMBLE_REMEDY = 'record with CARET or ros2_tracing of Humble or later'
+
 _NAME = re.compile(r'[A-Za-z][A-Za-z0-9_]*')
 
 

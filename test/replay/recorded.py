@@ -16,8 +16,6 @@ nodes:
 _MORE = {
     'ros2:dispatch_subscription_callback': (
         'message', 'callback', 'source_stamp', 'message_timestamp'),
-    'ros2:dispatch': ('message', 'callback'),
-    'ros2:dispatch_intra_process': ('message', 'callback'),
     'ros2_hook:take_type_erased': ('source_stamp', 'message'),
     'ros2:rmw_publish': ('message', 'timestamp_'),
     'ros2:rclcpp_intra_publish': ('publisher_handle', 'message'),
@@ -29,17 +27,13 @@ _MORE = {
     'ros2_caret:rcl_timer_init': ('timer_handle', 'period', 'init_timestamp'),
     'ros2_caret:dds_bind_addr_to_addr': ('addr_from', 'addr_to'),
     'ros2_hook:dds_write': ('message_addr',),
-    'ros2_hook:dds_bind_addr_to_addr': ('addr_from', 'addr_to'),
-    'ros2_hook:dds_bind_addr_to_stamp': ('addr_from', 'stamp_to'),
     'dds:write_pre': ('writer', 'data'),
-    'dds:write': ('writer', 'timestamp_'),
 }
 _JAZZY = EventType('ros2_caret', 'dds_write', (
     ('rmw_publisher_handle', 'uint64'), ('message', 'uint64'), ('timestamp_', 'int64')))
-STYLES = ('caret', 'fastdds', 'humble_fastdds', 'jazzy', 'hook', 'tracing', 'cyclone', 'rclpy')
+STYLES = ('caret', 'fastdds', 'humble_fastdds', 'jazzy', 'tracing', 'rclpy')
 """How a publication is recorded: by CARET with Cyclone DDS, with Fast DDS up to Galactic and from
-Humble on, from Jazzy on, and with Fast DDS in its first months; by ros2_tracing from Jazzy on, and
-before it with an instrumented Cyclone DDS; by CARET in rclpy."""
+Humble on, and from Jazzy on; by ros2_tracing from Jazzy on; by CARET in rclpy."""
 
 
 class Recorded:
@@ -131,40 +125,31 @@ class Recorded:
         def add(name, after, *fields):
             self.add(name, time + after * US, tid, *fields, pid=pid)
 
-        if style in ('tracing', 'cyclone'):
+        if style == 'tracing':
             add('ros2:rclcpp_publish', 0, 0, message, 0)
         elif style != 'rclpy':
             add('ros2:rclcpp_publish', 0, handle, message, 0)
         add('ros2:rcl_publish', 5, handle, message)
         if style == 'tracing':
             add('ros2:rmw_publish', 6, message, BEGIN + stamp)
-        elif style == 'cyclone':
-            add('ros2:rmw_publish', 6, message, 0)
-            add('dds:write_pre', 8, 0x77, message)
-            add('dds:write', 20, 0x77, BEGIN + stamp)
         elif style == 'jazzy':
             add('ros2_caret:dds_write#2', 8, handle, message, BEGIN + stamp)
         else:
-            provider = 'ros2_hook' if style == 'hook' else 'ros2_caret'
-            add(f'{provider}:dds_write', 8, message)
+            add('ros2_caret:dds_write', 8, message)
             address = message
-            if style in ('fastdds', 'hook'):
+            if style == 'fastdds':
                 address = 0x5550        # of one buffer, again and again
-                add(f'{provider}:dds_bind_addr_to_addr', 10, message, address)
+                add('ros2_caret:dds_bind_addr_to_addr', 10, message, address)
             elif style == 'humble_fastdds':
                 address = 0
-            add(f'{provider}:dds_bind_addr_to_stamp', 20, address, BEGIN + stamp)
+            add('ros2_caret:dds_bind_addr_to_stamp', 20, address, BEGIN + stamp)
         return stamp
 
     def receive(self, callback, tid, start, end, stamp, style='caret', stated=0, pid=1):
-        """Add an execution for a message, as `caret`, `august_2021` or `take` records it."""
+        """Add an execution for a message, as `caret` or `take` records it."""
         if style == 'caret':
             self.add('ros2:dispatch_subscription_callback', start - 4 * US, tid, 0x99, callback,
                      BEGIN + stamp, BEGIN + stated if stated else 0, pid=pid)
-        elif style == 'august_2021':
-            self.add('ros2_hook:take_type_erased', start - 6 * US, tid, BEGIN + stamp, 0x99,
-                     pid=pid)
-            self.add('ros2:dispatch', start - 4 * US, tid, 0x99, callback, pid=pid)
         else:
             self.add('ros2:rmw_take', start - 4 * US, tid, callback + 30_000, 0x99, BEGIN + stamp,
                      True, pid=pid)

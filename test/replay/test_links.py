@@ -4,6 +4,7 @@
 
 from mddag_executor.replay.drafting import System
 from mddag_executor.replay.run import open_recording
+from mddag_executor.trace.errors import TraceError
 import numpy as np
 import pytest
 
@@ -49,7 +50,7 @@ def recorded(tmp_path):
 
 
 @pytest.mark.parametrize('publish, receive', [
-    ('caret', 'caret'), ('hook', 'august_2021'), *((style, 'take') for style in STYLES)])
+    ('caret', 'caret'), *((style, 'take') for style in STYLES)])
 def test_messages_between_threads(recorded, publish, receive):
     for k in range(3):
         at = (k + 1) * 100 * MS
@@ -79,30 +80,24 @@ def test_the_subscriber_may_be_faster_than_the_tracer(recorded):
     assert warnings == []
 
 
-def test_a_lost_take_of_august_2021_links_nothing(recorded):
-    """The message's address is used again, so what was taken before is not what is dispatched."""
-    for at in (100 * MS, 200 * MS):
-        recorded.run(CAMERA, 1, at, at + 3 * MS)
-        stamp = recorded.publish(IMAGE, 1, at + MS, style='hook')
-        recorded.receive(DETECT, 2, at + 5 * MS, at + 6 * MS, stamp, style='august_2021')
-    lost = len(recorded.names()) - recorded.names()[::-1].index('ros2_hook:take_type_erased') - 1
-    got, warnings = linked(recorded.write(but=[lost]))
-    assert [link[2] for link in got.links if link[0].startswith('/detector')] == [101 * MS, None]
-    assert warnings == [
-        '1 execution for a message whose publication is not known: of no job and no path: '
-        '/detector subscription /image (1)']
+@pytest.mark.parametrize('event', [
+    ('ros2_hook:dds_write', 7), ('ros2_hook:take_type_erased', BEGIN, 7), ('dds:write_pre', 7, 8)])
+def test_a_recording_from_before_humble_is_refused_in_one_line(recorded, event):
+    recorded.run(CAMERA, 1, 100 * MS, 103 * MS)
+    recorded.add(event[0], 101 * MS, 1, *event[1:])
+    with pytest.raises(TraceError, match=r'd\.mcap: it was recorded before ROS 2 Humble, .*: '
+                       'record'):
+        linked(recorded.write())
 
 
-@pytest.mark.parametrize('dispatch', [
-    ('ros2:dispatch_intra_process_subscription_callback', 0), ('ros2:dispatch_intra_process',)])
-def test_messages_within_a_process_by_address(recorded, dispatch):
-    name, *rest = dispatch
+def test_messages_within_a_process_by_address(recorded):
     recorded.subscription(13, 2, '/image', within=14)
     for at, original in ((100 * MS, 0x500), (200 * MS, 0x500)):     # the address is used again
         recorded.run(CAMERA, 1, at, at + 3 * MS)
         recorded.add('ros2:rclcpp_intra_publish', at + MS, 1, IMAGE, original)
         recorded.add('ros2:message_construct', at + MS + 1, 1, original, 0x600)
-        recorded.add(str(name), at + 2 * MS, 2, 0x600, 14, *rest)
+        recorded.add('ros2:dispatch_intra_process_subscription_callback', at + 2 * MS, 2, 0x600,
+                     14, 0)
         recorded.run(14, 2, at + 2 * MS + 1, at + 5 * MS, within=True)
     got, warnings = linked(recorded.write())
     assert warnings == []

@@ -71,6 +71,15 @@ def test_unknown_events_keep_all_fields(tmp_path):
 
 
 @bt2
+def test_a_session_from_before_humble_is_refused_in_one_line(tmp_path):
+    folder = session(tmp_path / 's', [('ros2_hook:dds_write', [('message_addr', 'u64')])],
+                     [(0, 10, 1, 1, 'old', 11)])
+    with pytest.raises(TraceError, match='/s: it was recorded before ROS 2 Humble, .*: record'):
+        import_ctf(folder, tmp_path / 'out.mcap')
+    assert not (tmp_path / 'out.mcap').exists()
+
+
+@bt2
 def test_one_event_with_other_fields_in_another_process(tmp_path):
     session(tmp_path / 's/a', [('ros2_caret:dds_write', [('message', 'u64')])],
             [(0, 10, 1, 1, 'old', 11)])
