@@ -124,7 +124,7 @@ def _traces_in(path: str) -> Sequence[str]:
         from mddag_executor.replay.bags import is_ordinary
         names = os.listdir(path)
         found = sorted(name for name in names if name.endswith('.mcap'))
-        if len(found) > 1 and 'metadata.yaml' not in names and not is_ordinary(path):
+        if found and 'metadata.yaml' not in names and not is_ordinary(path):
             return [os.path.join(path, name) for name in found]
     return [path]
 

@@ -12,6 +12,8 @@ from mddag_executor.replay.clocks import offsets
 from mddag_executor.trace import TraceFile
 import pytest
 
+from ..report import runs
+
 MS = 1_000_000
 BASE = 10 ** 18
 GRAPH = """
@@ -289,6 +291,15 @@ def test_a_folder_is_the_run_of_all_traces_in_it(tmp_path, graph, call):
     Trace(before, 'other', 0, graph=TWO).end(MS)
     refused = call('diff', before, after)
     assert refused.returncode == 2 and 'another declaration' in refused.stderr
+
+
+def test_a_folder_with_one_trace_is_the_run_of_that_trace(tmp_path, call):
+    paths = [tmp_path / name for name in ('before', 'after')]
+    for path in paths:
+        path.mkdir()
+        runs.by_hand(path / 'run.mcap')
+    assert call('replay', paths[0]).stdout == call('replay', paths[0] / 'run.mcap').stdout
+    assert call('diff', *paths, '--fail-on-worse').returncode == 0
 
 
 def test_traces_of_different_runs_are_refused(tmp_path):
