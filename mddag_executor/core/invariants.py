@@ -40,7 +40,6 @@ def broken_invariants(t: Tables, s: State) -> Iterator[str]:
 def _all_queues(s: State) -> Iterator[tuple[str, list[QueueEntry]]]:
     yield 'the ready queue', s.ready
     yield 'what is held back', s.held_back
-    yield 'what is reserved for', s.reserved
     for group, heap in enumerate(s.group_heap):
         if heap:
             yield f'the heap of group {group}', heap
@@ -94,7 +93,7 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
         if owner >= 0 and (s.x_group[owner] != group or s.x_state[owner] not in ACTIVE):
             yield (f'group {group} is owned by execution {owner}, which has group '
                    f'{s.x_group[owner]} and state {s.x_state[owner]}')
-    coming = {s.x_group[entry[4]] for entry in (*s.ready, *s.held_back, *s.reserved)
+    coming = {s.x_group[entry[4]] for entry in (*s.ready, *s.held_back)
               if not is_stale(s, entry)}
     for group, heap in enumerate(s.group_heap):
         waiting = [entry[4] for entry in heap if not is_stale(s, entry)]

@@ -23,7 +23,6 @@ from mddag_executor.core.state import (
     OPEN,
     OTHER_KEYS,
     OUTDATED,
-    REFUSES,
     SINK_ABORTED,
     SINK_DROPPED,
     SINK_IN_TIME,
@@ -51,10 +50,6 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     s.free_slot[dag] = s.job_next[slot]
     s.job_index[slot] = job
     s.job_release[slot] = release
-    s.next_release[dag] = release + t.period[dag]
-    if s.scalars[REFUSES] > 0:
-        for process in range(len(s.reserved_from)):
-            s.reserved_from[process] = -NEVER
     if s.scalars[SKIP] > 0 and s.scalars[JUDGE_FROM] == -NEVER:
         s.scalars[JUDGE_FROM] = release + s.scalars[SKIP]
     s.job_state[slot] = OPEN
@@ -77,7 +72,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
 
 
 def demotes(t: Tables, s: State, dag: int) -> bool:
-    """Return whether jobs of a DAG are demoted when they are late, or refused (rule 7)."""
+    """Return whether jobs of a DAG are demoted when they are late, or give way (rule 7)."""
     return t.on_late[dag] == DEMOTE and s.scalars[URGENCY] != OTHER_KEYS
 
 

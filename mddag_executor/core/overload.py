@@ -5,28 +5,25 @@ Demoted jobs: rules 7 and 14 of the scheduling rules, which ``rules`` lists.
 
 An execution is checked (``demote``) when it comes first in a queue after ``State.start_by`` of its
 vertex.  That is the latest start with which all its sinks are in time; or the past if every
-execution of the vertex must be checked, because an older one is demoted or the vertex is refused.
-So work that is in time costs one comparison.  Like ``rules`` this module contains only integer
-arithmetic, list indexing and ``heapq``.
+execution of the vertex must be checked, because an older one is demoted or the vertex gives way to
+more important ones.  So work that is in time costs one comparison.  Like ``rules`` this module
+contains only integer arithmetic, list indexing and ``heapq``.
 
 docs/run.md names the sources.
 """
 
 from __future__ import annotations
 
-from heapq import heapify, heappop, heappush
+from heapq import heappop, heappush
 
 from mddag_executor.core.jobs import demotes, judge
-from mddag_executor.core.queues import add_stale, is_stale
+from mddag_executor.core.queues import add_stale
 from mddag_executor.core.state import (
-    CHECK_AT,
+    ABORTED,
     DEADLINE_KEYS,
     ELSEWHERE,
-    N_IDLE,
-    N_STALE,
     OPEN,
-    PREEMPTIVE,
-    REFUSES,
+    OTHER_KEYS,
     SINK_DEMOTED,
     START_KEYS,
     State,
@@ -36,15 +33,12 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tables import IMPORTANT, NEVER, Tables
 
 LATE_PATIENCE = 10
-"""A late job is ordered as if it were released this many relative deadlines after it was demoted:
-so demoted callbacks run, however long the overload lasts, with about a tenth of what they need."""
-USED_UP_PATIENCE = 1
-"""The same for a sink that tolerates no further miss."""
-REFUSED_PATIENCE = 100
-"""The same for a refused job."""
-RESERVED_PATIENCE = 10
-"""A refused execution leaves room for as many relative deadlines, so long ones run, too: with 3,
-0.4 % fewer important results are in time in the benchmark's sets at 1.2 interpreters."""
+"""
+A demoted job is ordered as if it were released this many relative deadlines after that.
+
+So its callbacks run, however long the overload lasts, with about a tenth of what they need.
+Less important work gives way to a late sink for as many of the sink's relative deadlines.
+"""
 PPM = 1_000_000
 
 
@@ -112,26 +106,26 @@ def late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
         begin += len(s.demoted[vertex]) * s.mean[vertex]
     elif s.x_started[x] >= 0:  # it was preempted
         begin -= s.x_cost[x] - s.x_left[x]
-    refused = _is_still_refused(t, s, vertex, now)
-    patience = REFUSED_PATIENCE if refused else LATE_PATIENCE
+    yields = _still_gives_way(t, s, vertex, now)
     deadline = NEVER
     start = NEVER
     for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
         sink = t.reach_sink[i]
-        if refused or begin > s.job_hope[slot] + s.reach_by[i]:
-            if not refused and _is_used_up(t, s, sink, s.job_index[slot]):
-                patience = USED_UP_PATIENCE
-            note_miss(t, s, slot, sink, now)
+        if yields or begin > s.job_hope[slot] + s.reach_by[i]:
+            note_late(t, s, slot, sink, now)
             _announce_demoted(t, s, slot, sink, now)
         else:
             deadline = min(deadline, t.reach_deadline[i])
             start = min(start, t.reach_start[i])
     if deadline < NEVER:
-        return _priority(t, s, x, s.job_release[slot], deadline, start)
+        release = s.job_release[slot]
+        if 0 <= s.waits_since[vertex] < release:
+            release = s.waits_since[vertex]
+        return _priority(t, s, x, release, deadline, start)
     if first >= 0:
         return s.x_key[first][0]
     if s.job_demoted[slot] < 0:
-        s.job_demoted[slot] = now + patience * t.dag_deadline[s.job_dag[slot]]
+        s.job_demoted[slot] = now + LATE_PATIENCE * t.dag_deadline[s.job_dag[slot]]
         if s.passed_on[vertex] >= 0:
             s.job_demoted[slot] = s.passed_on[vertex]
             s.passed_on[vertex] = -1
@@ -148,21 +142,43 @@ def is_late(t: Tables, s: State, x: int, now: int) -> bool:
     return vertex < t.n_vertices
 
 
-def inherit_age(t: Tables, s: State, x: int) -> None:
-    """Let an execution that was just made ready go as early as one that was dropped before it."""
-    vertex = s.x_vertex[x]
-    if s.passed_on[vertex] < 0 or s.x_state[x] != WAITING:
+def pass_on_age(t: Tables, s: State, x: int, now: int) -> None:
+    """Let the next execution of a vertex go as early as this one, which is about to be dropped."""
+    slot, vertex = s.x_slot[x], s.x_vertex[x]
+    if (vertex == t.n_vertices or s.scalars[URGENCY] == OTHER_KEYS
+            or s.job_state[slot] == ABORTED):
         return
-    priority = _priority(
-        t, s, x, s.passed_on[vertex], t.rad_offset[vertex], t.latest_start[vertex])
-    if priority < s.x_key[x][0]:
-        s.urged[vertex] = s.x_key[x][3]
-        _change_key(s, x, priority)
+    if s.job_hope[slot] < NEVER and s.job_demoted[slot] < 0 and s.job_state[slot] == OPEN:
+        late_priority(t, s, x, -1, now)  # demotes its job if that is late
+    since = s.job_demoted[slot]
+    if s.job_hope[slot] < NEVER and since >= 0:
+        if s.passed_on[vertex] < 0 or since < s.passed_on[vertex]:
+            s.passed_on[vertex] = since
+    elif s.waits_since[vertex] < 0 or s.job_release[slot] < s.waits_since[vertex]:
+        s.waits_since[vertex] = s.job_release[slot]
+
+
+def inherit_age(t: Tables, s: State, x: int) -> None:
+    """Let the first waiting execution of a vertex go as early as those dropped before it."""
+    vertex = s.x_vertex[x]
+    demoted, waits = s.passed_on[vertex], s.waits_since[vertex]
+    if demoted < 0 and waits < 0 or s.x_state[x] != WAITING or s.x_started[x] >= 0:
+        return
+    offset, start = t.rad_offset[vertex], t.latest_start[vertex]
+    if demoted >= 0:
+        priority = _priority(t, s, x, demoted, offset, start)
+        if priority < s.x_key[x][0]:
+            s.urged[vertex] = s.x_key[x][3]
+            _change_key(s, x, priority)
+    if waits >= 0 and not gives_way(t, s, vertex):
+        priority = _priority(t, s, x, waits, offset, start)
+        if priority < s.x_key[x][0]:
+            _change_key(s, x, priority)
 
 
 def set_start(t: Tables, s: State, vertex: int) -> None:
     """Set from when on an execution of a vertex that comes first is checked."""
-    if s.demoted[vertex] or is_refused(t, s, vertex):
+    if s.demoted[vertex] or gives_way(t, s, vertex):
         s.start_by[vertex] = -NEVER
         return
     s.start_by[vertex] = NEVER
@@ -174,38 +190,30 @@ def set_start(t: Tables, s: State, vertex: int) -> None:
 
 def admit(t: Tables, s: State) -> None:
     """
-    Set which importance is refused in each process (rule 14), and whether the rest is too much.
+    Set which importance gives way in each process (rule 14), and whether the rest is too much.
 
     A driver calls this at the begin and when the execution times have changed.
     """
     changed = False
-    s.scalars[REFUSES] = 0
     for process in range(1, len(s.overtaking)):
         workers = len(s.worker_x)
         if len(s.pool) > 0:
             workers = 0
             for worker in range(len(s.pool)):
                 workers += int(s.pool[worker] == process)
-        refused = s.refused_late[process]
+        below = s.late_importance[process]
         s.overloaded[process] = 1
         for importance in range(IMPORTANT + 1):
             demand, held = _demand(t, s, process, importance)
-            if demand > 0 and importance > refused:
-                refused = importance
+            if demand > 0 and importance > below:
+                below = importance
             if demand <= workers * PPM and held <= PPM:
-                s.overloaded[process] = int(importance > refused)
+                s.overloaded[process] = int(importance > below)
                 break
-        changed = changed or refused != s.refused_below[process]
-        s.refused_below[process] = refused
-        s.reserved_from[process] = -NEVER
-        s.scalars[REFUSES] = max(s.scalars[REFUSES], refused)
-    for dag in range(t.n_dags):
-        s.interpreter_time[dag] = 0
-    for vertex in range(t.n_vertices):
-        if s.holder[vertex] != 0 and s.expected[vertex] != ELSEWHERE and (
-                not is_refused(t, s, vertex)):
-            s.interpreter_time[t.dag_of[vertex]] += s.mean[vertex]
-        if changed:
+        changed = changed or below != s.demoted_below[process]
+        s.demoted_below[process] = below
+    if changed:
+        for vertex in range(t.n_vertices):
             set_start(t, s, vertex)
 
 
@@ -223,125 +231,35 @@ def _demand(t: Tables, s: State, process: int, importance: int) -> tuple[int, in
     return demand, held
 
 
-def is_refused(t: Tables, s: State, vertex: int) -> bool:
-    """Return whether jobs are refused at a vertex in its process, for more important ones."""
-    return (t.importance[vertex] < s.refused_below[_process(t, s, vertex)]
+def gives_way(t: Tables, s: State, vertex: int) -> bool:
+    """Return whether all jobs are demoted at a vertex, for more important ones (rule 14)."""
+    return (t.importance[vertex] < s.demoted_below[_process(t, s, vertex)]
             and demotes(t, s, t.dag_of[vertex]))
 
 
-def _is_still_refused(t: Tables, s: State, vertex: int, now: int) -> bool:
-    """Return whether jobs are refused at a vertex now: because of a late job only for a while."""
+def _still_gives_way(t: Tables, s: State, vertex: int, now: int) -> bool:
+    """Return whether a vertex gives way now: to a late sink it does only for a while."""
     process = _process(t, s, vertex)
-    if now > s.refused_until[process] and s.refused_late[process] > 0:
-        s.refused_late[process] = 0
+    if now > s.late_until[process] and s.late_importance[process] > 0:
+        s.late_importance[process] = 0
         admit(t, s)
-    return is_refused(t, s, vertex)
-
-
-def leaves_room(t: Tables, s: State, x: int, now: int) -> bool:
-    """
-    Return whether an execution ends before its interpreter or worker is reserved (rule 14).
-
-    Only refused ones may have to wait, for ``RESERVED_PATIENCE`` of their relative deadlines.
-    """
-    vertex = s.x_vertex[x]
-    if (s.x_started[x] >= 0 or not _is_still_refused(t, s, vertex, now)
-            or now >= s.x_key[x][0] - t.dag_deadline[t.dag_of[vertex]] * (
-                REFUSED_PATIENCE + 1 - RESERVED_PATIENCE)
-            or s.holder[vertex] == 0 and (s.scalars[N_IDLE] > 1 or s.scalars[PREEMPTIVE] != 0)):
-        return True
-    process = _process(t, s, vertex)
-    if now > s.reserved_from[process]:
-        s.reserved_from[process] = _next_start(t, s, process, now)
-    if now + s.mean[vertex] <= s.reserved_from[process]:
-        return True
-    s.scalars[CHECK_AT] = min(s.scalars[CHECK_AT], s.reserved_from[process] + 1)
-    return False
-
-
-def _next_start(t: Tables, s: State, process: int, now: int) -> int:
-    """Return until when the next jobs must start that are not refused and can be in time."""
-    first = NEVER
-    for dag in range(t.n_dags):
-        source = t.source[dag]
-        release = s.next_release[dag]
-        if release + t.dag_deadline[dag] >= now and (
-                _process(t, s, source) == process and not is_refused(t, s, source)):
-            start = release + t.rad_offset[source]
-            start -= _interpreter_time(t, s, now, start)
-            for i in range(t.first_reach[source], t.first_reach[source + 1]):
-                if s.reach_by[i] >= 0:
-                    latest = max(release, min(start, release + s.reach_by[i]))
-                    if latest >= now:
-                        first = min(first, latest)
-    return first
-
-
-def _interpreter_time(t: Tables, s: State, now: int, until: int) -> int:
-    """Return how long the next jobs with deadlines up to a time need the interpreter."""
-    needed = 0
-    for dag in range(t.n_dags):
-        if now < s.next_release[dag] + t.rad_offset[t.source[dag]] <= until:
-            needed += s.interpreter_time[dag]
-    return needed
-
-
-def return_reserved(t: Tables, s: State, now: int) -> None:
-    """Put the deferred executions that may start now into the ready queue."""
-    s.scalars[CHECK_AT] = NEVER
-    kept = 0
-    for i in range(len(s.reserved)):
-        entry = s.reserved[i]
-        if is_stale(s, entry):
-            s.scalars[N_STALE] -= 1
-        elif leaves_room(t, s, entry[4], now):
-            heappush(s.ready, entry)
-        else:
-            s.reserved[kept] = entry
-            kept += 1
-    del s.reserved[kept:]
-    heapify(s.reserved)
+    return gives_way(t, s, vertex)
 
 
 def _process(t: Tables, s: State, vertex: int) -> int:
     return 1 if len(s.pool) == 0 else t.process[vertex]
 
 
-def _refuse_for(t: Tables, s: State, sink: int, now: int) -> None:
-    """Refuse what is less important than a sink that missed a deadline, for a while."""
+def note_late(t: Tables, s: State, slot: int, sink: int, now: int) -> None:
+    """Note that a sink is late: less important work gives way to it for a while (rule 14)."""
+    if s.job_hope[slot] == NEVER or gives_way(t, s, sink):
+        return  # late jobs of the DAG are not demoted, or it must itself give way
     process = _process(t, s, sink)
-    if t.importance[sink] >= s.refused_late[process]:
-        s.refused_until[process] = now + REFUSED_PATIENCE * t.sink_deadline[sink]
-    if t.importance[sink] > s.refused_late[process]:
-        s.refused_late[process] = t.importance[sink]
+    if t.importance[sink] >= s.late_importance[process]:
+        s.late_until[process] = now + LATE_PATIENCE * t.sink_deadline[sink]
+    if t.importance[sink] > s.late_importance[process]:
+        s.late_importance[process] = t.importance[sink]
         admit(t, s)
-
-
-# --- tolerated misses ----------------------------------------------------------------------------
-
-def _is_used_up(t: Tables, s: State, sink: int, job: int) -> bool:
-    """Return whether a sink tolerates no miss of this job: it has missed as many before."""
-    if t.tolerated[sink] == 0:
-        return False
-    oldest = s.missed_jobs[t.first_miss[sink] + s.next_miss[sink]]
-    return oldest > job - t.tolerated_of[sink]
-
-
-def note_miss(t: Tables, s: State, slot: int, sink: int, now: int) -> None:
-    """Note a job that misses the deadline of a sink; a job may be noted more than once."""
-    if s.job_hope[slot] == NEVER:
-        return  # late jobs of the DAG are not demoted
-    if not is_refused(t, s, sink):
-        _refuse_for(t, s, sink, now)
-    misses = t.tolerated[sink]
-    if misses == 0:
-        return
-    job = s.job_index[slot]
-    first = t.first_miss[sink]
-    place = s.next_miss[sink]
-    if s.missed_jobs[first + (place + misses - 1) % misses] < job:
-        s.missed_jobs[first + place] = job
-        s.next_miss[sink] = (place + 1) % misses
 
 
 def _announce_demoted(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:

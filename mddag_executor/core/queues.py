@@ -60,7 +60,7 @@ def add_stale(s: State) -> None:
 
 def _sweep(s: State) -> None:
     """Remove stale entries from all queues when they are the larger part: memory is bounded."""
-    length = len(s.ready) + len(s.held_back) + len(s.reserved)
+    length = len(s.ready) + len(s.held_back)
     for group in range(len(s.group_heap)):
         length += len(s.group_heap[group])
     for entity in range(len(s.entity_queue)):
@@ -70,7 +70,6 @@ def _sweep(s: State) -> None:
     seen = [False] * len(s.x_state)
     _keep_valid(s, s.ready, seen)
     _keep_valid(s, s.held_back, seen)
-    _keep_valid(s, s.reserved, seen)
     for group in range(len(s.group_heap)):
         _keep_valid(s, s.group_heap[group], seen)
     for entity in range(len(s.entity_queue)):

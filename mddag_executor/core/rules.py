@@ -46,14 +46,14 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     queue after the deadline of an incomplete sink; started ones finish.  ``DEMOTE`` lowers the
     priority of an execution that comes first in a queue, if none of its sinks can be in time: the
     time plus the mean execution times on the longest path to the sink is past its deadline.  From
-    then on its job counts as released ``LATE_PATIENCE`` relative deadlines later (one, if a sink
-    has used up the misses that it tolerates).  So demoted jobs age, and each callback gets some
-    time.  An execution with sinks of both kinds has as RAD the earliest deadline of those that can
-    be in time.  Executions of one vertex keep their order: one that comes first while older ones
-    are demoted has to wait for these.  If it can be in time, the oldest inherits its priority, so
-    a backlog is worked off; if not, it is demoted behind the oldest.  If one is dropped (rule 13,
-    or live a full queue), the next one counts as released as early, if it is late or that is
-    earlier.  In a lasting overload (``State.overloaded``) the mean execution times of the older
+    then on its job counts as released ``LATE_PATIENCE`` relative deadlines later.  So demoted jobs
+    age, and each callback gets some time.  An execution with sinks of both kinds has as RAD the
+    earliest deadline of those that can be in time.  Executions of one vertex keep their order: one
+    that comes first while older ones are demoted has to wait for these.  If it can be in time, the
+    oldest inherits its priority, so a backlog is worked off; if not, it is demoted behind the
+    oldest.  Age is a property of the queue: if an execution is dropped (rule 13, or live a full
+    queue), the next one of its vertex counts as released as early as the dropped one did, until
+    one starts.  In a lasting overload (``State.overloaded``) the mean execution times of the older
     ones count, too.  Running executions keep their keys.  Only policies whose keys are times
     demote.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
@@ -84,18 +84,14 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     preemption and no polling then.
 13. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
     one that has not started is dropped when that of a later job becomes ready.  So is a release of
-    a timer if its job is demoted then, or refused (``KEEP_TIMELY``).  A job without its source is
+    a timer if its job is demoted then (``KEEP_TIMELY``).  A job without its source is
     ``OUTDATED``; a dropped sink is not in time.
-14. **Importance.**  A vertex has the highest importance of the sinks that it leads to.  If the
-    known execution times demand more than the workers or the interpreter of a process can give,
-    the least importance is refused, as many as necessary, but never the highest.  Less importance
-    than that of a sink that missed a deadline is refused for ``REFUSED_PATIENCE`` of its relative
-    deadlines, too.  Refused jobs (of DAGs that ``DEMOTE``) count as released that many relative
-    deadlines later.  Before, for ``RESERVED_PATIENCE`` of them, their executions leave room
-    (``State.reserved``): without preemption, one that would need the interpreter or the last idle
-    worker beyond the latest time from which the next jobs that are not refused can be in time,
-    sharing the interpreter, waits for these, or until it is later than that.  Such a job is
-    expected one period after the last release of its DAG.
+14. **Importance.**  A vertex has the highest importance of the sinks that it leads to, over
+    trigger and queue edges.  While an important sink is late, or the known execution times demand
+    more than the workers or the interpreter of a process can give, work of lower importance is
+    demoted as if it were late (rule 7), and nothing more.  A sink counts as late for
+    ``LATE_PATIENCE`` of its relative deadlines.  Of too much demand the least importance is
+    demoted, as many levels as necessary, but never the highest.
 """
 
 from __future__ import annotations
@@ -114,9 +110,8 @@ from mddag_executor.core.overload import (
     demote,
     inherit_age,
     late_priority,
-    leaves_room,
-    note_miss,
-    return_reserved,
+    note_late,
+    pass_on_age,
 )
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
@@ -131,7 +126,6 @@ from mddag_executor.core.queues import (
 from mddag_executor.core.state import (
     ABORTED,
     add_slot,
-    CHECK_AT,
     COMPLETED,
     DISPATCH_OVERHEAD,
     DONE,
@@ -150,7 +144,6 @@ from mddag_executor.core.state import (
     PREEMPTIVE,
     PROPAGATE,
     QueueEntry,
-    REFUSES,
     RUNNING,
     SINK_IN_TIME,
     SINK_LATE,
@@ -222,7 +215,7 @@ def _outdate(t: Tables, s: State, x: int, now: int) -> None:
             give_up(t, s, slot, OUTDATED, now)
         else:
             outdate_sink(t, s, slot, vertex, now)
-    drop(s, x, now)
+    drop(t, s, x, now)
 
 
 def ready_undeclared(
@@ -263,7 +256,7 @@ def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
         make_ready(t, s, key, x, now)
 
 
-def drop(s: State, x: int, now: int) -> None:
+def drop(t: Tables, s: State, x: int, now: int) -> None:
     """
     Drop a waiting execution, for example because its queue is full; it never runs.
 
@@ -271,10 +264,9 @@ def drop(s: State, x: int, now: int) -> None:
     part.
     """
     in_queue = s.x_state[x] == WAITING  # a refused execution is in no queue
+    pass_on_age(t, s, x, now)
     s.x_state[x] = DROPPED
     slot = s.x_slot[x]
-    if s.job_demoted[slot] >= 0:
-        s.passed_on[s.x_vertex[x]] = s.job_demoted[slot]
     dag = s.job_dag[slot]
     s.decisions.append((DROP, dag, s.x_vertex[x], s.job_index[slot], x, now))
     group = s.x_group[x]
@@ -296,11 +288,9 @@ def peek(t: Tables, s: State, now: int) -> int:
 
     Entries that cannot be next leave the queue: dropped and aborted executions for good, those
     with a busy group into the group's heap (rule 4) or to the next poll (rule 9), those that may
-    not start into a heap of deferred ones (rules 11, 12 and 14).  Late ones are demoted (rule 7).
+    not start into a heap of deferred ones (rules 11 and 12).  Late ones are demoted (rule 7).
     """
     again = True
-    if s.scalars[CHECK_AT] < NEVER:
-        return_reserved(t, s, now)
     while True:
         queue = s.ready
         if s.held_back or s.scalars[N_STALE] > 0:
@@ -322,9 +312,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                     _release_group(s, group)  # others of the group may go first
             elif ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
                     and not may_start(t, s, entry)):
-                _defer(s, queue, s.held_back)
-            elif s.scalars[REFUSES] > 0 and not leaves_room(t, s, x, now):
-                _defer(s, queue, s.reserved)
+                _defer(s, queue)
             elif vertex == t.n_vertices:
                 return x
             else:
@@ -336,7 +324,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                     give_up(t, s, slot, ABORTED, now)
                 if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
                     return x
-                drop(s, x, now)
+                drop(t, s, x, now)
                 again = True
             queue = next_queue(t, s, False)
         if not again or len(s.unpolled) == 0:
@@ -345,10 +333,10 @@ def peek(t: Tables, s: State, now: int) -> int:
         poll(t, s)
 
 
-def _defer(s: State, queue: list[QueueEntry], to: list[QueueEntry]) -> None:
-    """Move the first of a queue to another one; others of its callback group may go first."""
+def _defer(s: State, queue: list[QueueEntry]) -> None:
+    """Defer the first execution of a queue; others of its callback group may go first."""
     entry = heappop(queue)
-    heappush(to, entry)
+    heappush(s.held_back, entry)
     group = s.x_group[entry[4]]
     if group >= 0 and s.group_owner[group] == -1:
         _release_group(s, group)
@@ -369,7 +357,7 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
     if s.x_started[x] < 0:
-        s.passed_on[s.x_vertex[x]] = -1
+        s.passed_on[s.x_vertex[x]] = s.waits_since[s.x_vertex[x]] = -1
     s.x_started[x] = now
     s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
     s.worker_x[worker] = x
@@ -536,7 +524,7 @@ def _complete_vertex(
         judge(s, slot, SINK_LATE if late else SINK_IN_TIME, vertex, deadline, now)
         if late:
             s.job_late[slot] += 1
-            note_miss(t, s, slot, vertex, now)
+            note_late(t, s, slot, vertex, now)
     if is_sink or s.expected[vertex] == LEADS_OUT:
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:

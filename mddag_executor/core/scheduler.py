@@ -67,7 +67,7 @@ class Scheduler:
         self.complete: Callable[[int, int], bool] = partial(
             rules.complete, *rule, self.policy.key)
         self.fail: Callable[[int, int], bool] = partial(rules.fail, *rule, self.policy.key)
-        self.drop: Callable[[int, int], None] = partial(rules.drop, self.state)
+        self.drop: Callable[[int, int], None] = partial(rules.drop, *rule)
         self.lend, self.stop_holding, self.suspend, self.refuse, self.leave_group, self.resume = (
             partial(function, self.state) for function in (
                 rules.lend, rules.stop_holding, rules.suspend, rules.refuse, rules.leave_group,
@@ -138,7 +138,7 @@ class Scheduler:
         """Return the number of executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
         waiting += sum(len(queue) for queue in self.state.entity_queue)
-        waiting += len(self.state.held_back) + len(self.state.reserved)
+        waiting += len(self.state.held_back)
         waiting += sum(map(self._is_refused, self.state.group_owner))
         return len(self.state.ready) + waiting - self.state.scalars[N_STALE]
 

@@ -25,10 +25,9 @@ FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 # Where a vertex is expected to run; LEADS_OUT: here, and a successor is not.
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
-# Columns of ``scalars``.  ``REFUSES``: whether any process refuses an importance; ``CHECK_AT``:
-# when an execution in ``reserved`` may start although nothing else happens; NEVER: there is none.
+# Columns of ``scalars``.  ``FORGET_AT``: until when no measured execution time is too old.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_HOLDING, URGENCY, REFUSES, CHECK_AT, N_SCALARS) = range(15)
+ JUDGE_FROM, SKIP, N_HOLDING, URGENCY, FORGET_AT, N_SCALARS) = range(14)
 
 # Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
 # them, or deadlines of DAGs.
@@ -57,11 +56,10 @@ class State(NamedTuple):
     """Everything that changes during a run; see ``fill_state``."""
 
     scalars: list[int]
-    # heaps: the ready queue, the executions deferred for the interpreter or a worker, those that
-    # leave it to a more important job, and for each callback group those that wait for it
+    # heaps: the ready queue, the executions deferred for the interpreter or a worker, and for each
+    # callback group those that wait for it
     ready: list[QueueEntry]
     held_back: list[QueueEntry]
-    reserved: list[QueueEntry]
     group_heap: list[list[QueueEntry]]
     group_owner: list[int]
     # under a policy that polls: a heap for each entity, and the entities with entries
@@ -74,41 +72,35 @@ class State(NamedTuple):
     overtaking: list[int]
     # the executions of undeclared callbacks that may be used again
     undeclared: list[int]
-    # by process, from 1: the least importance that is not refused, and whether that needs too much
-    refused_below: list[int]
+    # by process, from 1: the least importance that is not demoted, and whether that needs too much
+    demoted_below: list[int]
     overloaded: list[int]
-    # the same because of late jobs, and until when
-    refused_late: list[int]
-    refused_until: list[int]
-    # from when on it is reserved for the next release that is not refused
-    reserved_from: list[int]
+    # the highest importance of the sinks that were late, and until when they count
+    late_importance: list[int]
+    late_until: list[int]
     # by DAG
     free_slot: list[int]
     oldest: list[int]
     newest: list[int]
     n_open: list[int]
-    next_release: list[int]
-    # how long a job needs the interpreter, without refused vertices
-    interpreter_time: list[int]
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
     # by vertex: from when on its executions are checked (see ``overload``); with ``keep: newest``,
     # the execution that became ready last; a heap of the demoted executions that wait, by order;
-    # the order of the one that a newer one made urgent last, or -1; ``job_demoted`` of the one
-    # dropped last, until the next one starts, or -1; the known mean execution time, and whether it
-    # holds the interpreter
+    # the order of the one that a newer one made urgent last, or -1; of those that were dropped
+    # since the last one started, or -1: the least ``job_demoted``, and the least release of one
+    # that was not demoted; the known mean execution time, and whether it
+    # holds the interpreter; when that time was measured last, or -1: it is the declared one
     start_by: list[int]
     newest_ready: list[int]
     demoted: list[list[QueueEntry]]
     urged: list[int]
     passed_on: list[int]
+    waits_since: list[int]
     mean: list[int]
     holder: list[int]
-    # of a sink that tolerates misses: its last ones, from ``Tables.first_miss`` on, as a ring, and
-    # the place of the oldest
-    missed_jobs: list[int]
-    next_miss: list[int]
+    measured_at: list[int]
     # ``Tables.reach_start`` with the known execution times
     reach_by: list[int]
     # by slot
@@ -121,7 +113,7 @@ class State(NamedTuple):
     job_late: list[int]
     # base of its latest starts: its release; NEVER: it continues when it is late
     job_hope: list[int]
-    # the release that counts for its order since it was late or refused, or -1
+    # the release that counts for its order since it was demoted, or -1
     job_demoted: list[int]
     job_active: list[int]
     job_next: list[int]
@@ -190,19 +182,18 @@ def fill_state(
     s.scalars[POLLING] = polling
     s.scalars[URGENCY] = urgency
     s.scalars[JUDGE_FROM] = -NEVER
-    s.scalars[CHECK_AT] = NEVER
+    s.scalars[FORGET_AT] = NEVER
     for v in range(t.n_vertices + 1):
         s.start_by.append(t.latest_start[v])
         s.newest_ready.append(-1)
         add_queue(s.demoted)
         s.urged.append(-1)
         s.passed_on.append(-1)
+        s.waits_since.append(-1)
         s.mean.append(t.mean_time[v])
         s.holder.append(0)
-        s.next_miss.append(0)
+        s.measured_at.append(-1)
         s.expected.append(HERE)
-        for _ in range(t.tolerated[v]):
-            s.missed_jobs.append(-NEVER)
     for i in range(len(t.reach_start)):
         s.reach_by.append(t.reach_start[i])
     for _ in range(2):
@@ -219,8 +210,6 @@ def fill_state(
         s.oldest.append(-1)
         s.newest.append(-1)
         s.n_open.append(0)
-        s.next_release.append(-NEVER)
-        s.interpreter_time.append(0)
         s.partial.append(0)
 
 
@@ -279,11 +268,10 @@ def divide(s: State, workers: list[int]) -> None:
 def add_process(s: State) -> None:
     """Add the columns of a process."""
     s.overtaking.append(1)
-    s.refused_below.append(0)
+    s.demoted_below.append(0)
     s.overloaded.append(0)
-    s.refused_late.append(0)
-    s.refused_until.append(-NEVER)
-    s.reserved_from.append(-NEVER)
+    s.late_importance.append(0)
+    s.late_until.append(-NEVER)
 
 
 def add_group(s: State) -> int:

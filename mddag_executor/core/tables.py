@@ -28,9 +28,8 @@ least difference of these sinks' deadlines and the longest paths to them (least 
 * ``reach_deadline``, ``reach_start``: the same two of each sink that the vertex leads to
 (``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
 execution time, ``height`` the number of edges on the longest path to a sink.
-* ``importance``: the highest of the sinks that it leads to.  ``tolerated``, ``tolerated_of``: of a
-sink with ``tolerate: m of k``, else 0; ``first_miss``: the number of misses that the sinks before
-it tolerate.
+* ``importance``: the highest of the sinks that it leads to, over trigger and queue edges.
+``tolerated``, ``tolerated_of``: of a sink with ``tolerate: m of k``, else 0.
 
 ``process`` is the number of the declared process that a callback runs in, from 1.
 
@@ -112,7 +111,6 @@ class Tables(NamedTuple):
     importance: list[int]
     tolerated: list[int]
     tolerated_of: list[int]
-    first_miss: list[int]
     sink_deadline: list[int]
     entity: list[int]
     chain_rank: list[int]
@@ -153,6 +151,7 @@ class Tables(NamedTuple):
         columns.enter(task_set.callbacks if task_set is not None else ())
         for dag in task_set.dags if task_set is not None else ():
             columns.add_dag(dag)
+        columns.lists['importance'] += [] if task_set is None else importances(task_set)
         columns.lists['process'] += [] if task_set is None else processes_of(task_set)
         return columns.finish(default_deadline)
 
@@ -213,12 +212,9 @@ class _Columns:
             lists['first_reach'].append(len(lists['reach_sink']))
             lists['mean_time'].append(mean_time(vertex))
             lists['height'].append(heights[vertex.index])
-            lists['importance'].append(max(
-                IMPORTANCE[dag.vertices[sink].callback.importance] for sink, _, _ in sinks))
             tolerate = vertex.callback.tolerate
             lists['tolerated'].append(0 if tolerate is None else tolerate.misses)
             lists['tolerated_of'].append(0 if tolerate is None else tolerate.of)
-            lists['first_miss'].append(sum(lists['tolerated'][:-1]))
             lists['keep'].append(
                 KEEP_NEWEST if vertex.callback.keep == 'newest'
                 else KEEP_TIMELY if vertex.callback.kind == 'timer' else KEEP_ALL)
@@ -258,7 +254,7 @@ class _Columns:
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
             'latest_start': default_deadline, 'first_reach': len(lists['reach_sink']),
             'keep': KEEP_ALL, 'mean_time': 0, 'height': 0,
-            'importance': IMPORTANT, 'tolerated': 0, 'tolerated_of': 0, 'first_miss': 0,
+            'importance': IMPORTANT, 'tolerated': 0, 'tolerated_of': 0,
             'sink_deadline': -1,
             'entity': self._n_entities, 'region_offset': 0,
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
@@ -290,6 +286,38 @@ def processes_of(task_set: TaskSet) -> list[int]:
     place = {node: number for number, process in enumerate(task_set.processes, 1)
              for node in process.nodes}
     return [place.get(vertex.callback.node, 1) for vertex in task_set.vertices]
+
+
+def importances(task_set: TaskSet) -> list[int]:
+    """
+    Return the importance of each vertex: the highest of the sinks that need it.
+
+    It is inherited backwards over trigger edges, and over queue edges: from a callback to those
+    whose data it reads.
+    """
+    found = [IMPORTANCE[vertex.callback.importance] if vertex.deadline_ns is not None else 0
+             for vertex in task_set.vertices]
+    of: dict[str, list[int]] = {}
+    for number, vertex in enumerate(task_set.vertices):
+        of.setdefault(vertex.callback.key, []).append(number)
+    before: list[set[int]] = [set() for _ in found]
+    first = 0
+    for dag in task_set.dags:
+        for vertex in dag.vertices:
+            before[first + vertex.index].update(first + each for each in vertex.predecessors)
+        first += len(dag.vertices)
+    for edge in task_set.queue_edges:
+        for reader in of.get(edge.reader, ()):
+            before[reader].update(*(of.get(writer, ()) for writer in edge.writers))
+    # the most important first: each vertex is reached once with its importance
+    for importance in range(IMPORTANT, 0, -1):
+        reached = [number for number, each in enumerate(found) if each == importance]
+        while reached:
+            for number in before[reached.pop()]:
+                if found[number] < importance:
+                    found[number] = importance
+                    reached.append(number)
+    return found
 
 
 def rad_offsets(dag: Dag) -> list[int]:

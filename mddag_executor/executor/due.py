@@ -112,8 +112,6 @@ class DueTimes:
         first = timer
         if deadline < NEVER:
             first = min(first, deadline - offset + 1)
-        if now + offset < self._engine.check_at < NEVER:
-            first = min(first, self._engine.check_at - offset)
         if self._calls:
             first = min(first, self._calls[0][0])
         if muting.until:

@@ -42,10 +42,9 @@ from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.estimates import note_time
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
-from mddag_executor.core.overload import admit, is_late
+from mddag_executor.core.overload import admit, inherit_age, is_late
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE, TURN_NS
 from mddag_executor.core.state import (
-    CHECK_AT,
     DAG_KEYS,
     DEADLINE_KEYS,
     EXPIRED,
@@ -357,6 +356,8 @@ class Engine:
         work.x = x
         work.ready_ns = now
         entity.ready += 1
+        if not entity.waiting:
+            inherit_age(self.tables, state, x)
         entity.waiting[x] = None
         self._work[x] = work
         if state.decisions:
@@ -401,6 +402,8 @@ class Engine:
         self._drop(entity, next(iter(waiting)), 'qos_depth', now)
         while waiting and is_late(self.tables, self._state, x := next(iter(waiting)), now):
             self._drop(entity, x, 'qos_depth', now)
+        if waiting:
+            inherit_age(self.tables, self._state, next(iter(waiting)))
 
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""
@@ -418,17 +421,12 @@ class Engine:
 
     def _core_has_waiting(self) -> bool:
         state = self._state
-        return bool(state.ready or state.held_back or state.reserved or state.unpolled)
+        return bool(state.ready or state.held_back or state.unpolled)
 
     @property
     def queue_length(self) -> int:
         """Return the number of executions that wait, for a worker or for their group."""
         return len(self._lane) + self.scheduler.queue_length
-
-    @property
-    def check_at(self) -> int:
-        """Return when an execution may start although nothing else happens; NEVER: none waits."""
-        return self._state.scalars[CHECK_AT]
 
     def waits_since(self, now: int) -> int:
         """Return since when the most urgent of the ready executions has waited; now: none does."""
@@ -643,7 +641,7 @@ class Engine:
                     end, now, whole, x - state.job_base[slot] - tables.region_offset[vertex],
                     work.cpu_ns, state.x_holds[x])
             if whole:  # other messages of a sync take less
-                note_time(tables, state, vertex, entity.habit.needs_ns, entity.habit.holds)
+                note_time(tables, state, vertex, entity.habit.needs_ns, entity.habit.holds, now)
         elif record is not None:
             self._record_run(work, start, end, vtid, worker)
         if self._state.decisions:

@@ -49,6 +49,8 @@ COMPUTES = 0.8
 """A callback that computes for this fraction of its time holds the GIL."""
 WAITS = 0.5
 """A callback that computes for less than this fraction of its available time has waited."""
+FIRST_RUNS = 3
+"""The first executions (loading, JIT, page faults) say little about the usual time."""
 SHORT_NS = 2_000
 """A callback that usually computes for less than half of this is not worth ordering."""
 LATELY = 8
@@ -82,18 +84,21 @@ class GilHabit:
     :ivar holds: 1 or 0, for its next execution; ``computes``: the same, also if it is short.
     :ivar mean_ns: recent average of its executions' CPU time.
     :ivar needs_ns: how long it takes when nothing disturbs it: ``mean_ns`` or, unless it computes,
-        the least duration of recent executions if that is longer.
+        the least duration of recent executions if that is longer.  The first ``FIRST_RUNS`` do not
+        count; -1: there was no other one yet.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
     :ivar rests: how many of its next executions need not be measured, if it is positive.
     """
 
     __slots__ = ('holds', 'computes', 'mean_ns', 'needs_ns', 'is_known', 'is_declared', 'rests',
-                 'share', '_least', '_unclear', '_runs', '_is_trial')
+                 'share', '_least', '_first', '_unclear', '_runs', '_is_trial')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.is_declared = self.is_known = declared is not None
         self.holds = self.computes = int(declared or False)
-        self.mean_ns = self.needs_ns = self._least = 0
+        self.mean_ns = self._least = 0
+        self.needs_ns = -1
+        self._first = FIRST_RUNS
         self.rests = 0
         self.share: float | None = None if declared is None else float(declared)
         self._unclear = 0
@@ -107,12 +112,19 @@ class GilHabit:
         :param own: CPU time of an execution, ns.
         :param undisturbed: at most how long it would have taken if nothing had disturbed it, ns.
         """
+        counts = self._first == 0
+        if not counts:
+            self._first -= 1
+        elif self.needs_ns < 0:
+            self._runs = 0  # begin again, without the first ones
         runs = self._runs = min(self._runs + 1, LATELY)
         self.mean_ns += (own - self.mean_ns) // runs
         # the least is forgotten slowly
         self._least = undisturbed if runs == 1 else min(
             undisturbed, self._least + self._least // SELDOM + 1)
-        self.needs_ns = self.mean_ns if self.computes else max(self.mean_ns, self._least)
+        if counts:
+            self.needs_ns = self.mean_ns if self.computes else max(
+                self.mean_ns, self._least)
 
     def learn(self, wall: int, own: int, others: int, starved: bool = False) -> None:
         """
@@ -126,7 +138,7 @@ class GilHabit:
         if not self.is_declared:
             self._learn(wall, own, others, starved)
         self.rests = 0
-        if self.is_known and not self._is_trial:
+        if self.is_known and not self._is_trial and self.needs_ns >= 0:
             self.rests = (SELDOM if self._runs == LATELY else LATELY) - 1
 
     def _learn(self, wall: int, own: int, others: int, starved: bool) -> None:

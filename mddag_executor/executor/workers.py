@@ -43,7 +43,6 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core.queues import TURN_NS
-from mddag_executor.core.tables import NEVER
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     END_S,
@@ -545,8 +544,7 @@ class WorkerPool:
         due = self.due
         work = engine.dispatch(me.worker, now) if self.running else None
         if (engine.deadlines.next < due.deadline
-                or work is None and (
-                    due.may_expire_early or engine.holders or engine.check_at < NEVER)):
+                or work is None and (due.may_expire_early or engine.holders)):
             due.arm(now - self._offset)
         if work is None:
             self.log_misses()

@@ -243,8 +243,6 @@ class Loop:
             self.now + 1, min(self._machine.scalars[NEXT_TIME], *self._finish_at))
         if self._events:
             next_at = min(next_at, self._events[0][0])
-        if self.engine.check_at > self.now:  # else a worker is needed first
-            next_at = min(next_at, self.engine.check_at)
         if self.engine.holders and self.engine.has_waiting:  # it may overtake by then
             next_at = min(next_at, self.now + POLL_NS)
         if next_at > self.end + DRAIN_NS:

@@ -29,7 +29,6 @@ from mddag_executor.core import jobs, overload, rules
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import (
     add_slot,
-    CHECK_AT,
     divide,
     EXPIRED,
     fill_state,
@@ -108,7 +107,6 @@ def run(
         for w in range(n_workers):
             if finish_at[w] < instant:
                 instant = finish_at[w]
-        instant = min(instant, s.scalars[CHECK_AT])
         if sends:
             instant = min(instant, next_arrival(d))
         if stops:

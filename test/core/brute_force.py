@@ -26,8 +26,9 @@ Its reading of the documents:
   the workers, it is late if the mean time of each execution that was demoted there leaves it no
   deadline within reach.
 * ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
-  vanishes when the next one is ready. If it was late, the next late one goes as early. So does
-  one of a timer that cannot make any deadline that it leads to any more, with ``demote``.
+  vanishes when the next one is ready. So does one of a timer that cannot make any deadline that it
+  leads to any more, with ``demote``. Until one of the callback starts, the next ones go as early
+  as the earliest that vanished: by its job's release, or if it was late by the one that counted.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
   the next round is, of all that waits, the first of each callback. The worker goes through it by
   kind (timers, subscriptions and syncs, services), then by the callback's place in the file, and
@@ -123,6 +124,7 @@ class BruteForce:
         # by DAG and vertex: the demoted executions by arrival, and the arrival of the urged one
         self.demoted = {}
         self.passed_on = {}
+        self.waits_since = {}
         self.urged = {}
         self.round = []
         self.jobs = []
@@ -225,6 +227,9 @@ class BruteForce:
             now += ahead * mean(vertex)
         within = {sink for sink, start in starts.items() if now <= start}
         lowest = self._priority(execution, within or {*starts})
+        if within:
+            since = self.waits_since.get((job.dag.index, vertex.index), job.release)
+            return lowest - max(0, job.release - since) * self.tick // unit
         if not within and older is not None:
             return self.priority(older)
         if not within:
@@ -320,13 +325,25 @@ class BruteForce:
             if aged < self.priority(new):
                 new.lowered = aged
                 self.urged[job.dag.index, vertex.index] = new.arrival
+        since = self.waits_since.get((job.dag.index, vertex.index))
+        if since is not None and new in self.waiting:
+            unit = 1 if self.policy == 'llf' else self.tick
+            starts = self.laxity[job.dag.index, vertex.index]
+            aged = self._priority(new, {*starts}) - (job.release - since) * self.tick // unit
+            if aged < self.priority(new):
+                new.lowered = aged
 
     def _drop(self, dropped):
         for old in sorted(dropped, key=lambda e: -e.job.index):
             self.waiting.remove(old)
             job, sink = old.job, old.vertex.index
-            if job.demoted is not None:
-                self.passed_on[job.dag.index, sink] = job.demoted
+            key = job.dag.index, sink
+            if self.policy in ('rad', 'gedf', 'llf'):
+                if job.demoted is not None:
+                    self.passed_on[key] = min(job.demoted, self.passed_on.get(key, job.demoted))
+                else:
+                    self.waits_since[key] = min(
+                        job.release, self.waits_since.get(key, job.release))
             if job.outcome is not None:
                 continue
             if old.vertex.predecessors:
@@ -477,6 +494,7 @@ class BruteForce:
         self.waiting.remove(execution)
         if not execution.has_run:
             self.passed_on.pop((execution.job.dag.index, execution.vertex.index), None)
+            self.waits_since.pop((execution.job.dag.index, execution.vertex.index), None)
         execution.has_run = True
         execution.left += self.case.dispatch_overhead
         self.running[worker] = execution

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from mddag_executor.core.estimates import note_time
 from mddag_executor.core.jobs import is_miss
+from mddag_executor.core.tables import importances
 from mddag_executor.core.tally import counts
 from mddag_executor.simulate import Settings, simulate
 from msg_graph import ExecutionTime
@@ -145,7 +147,7 @@ def test_less_important_sinks_are_demoted_first(preemptive):
     assert high == normal  # normal is more than low
 
 
-def test_the_highest_importance_is_never_refused():
+def test_the_highest_importance_never_gives_way():
     low, high, undeclared = (results(case_of(*(
         timer(name, 10, 10, 8, **more) for name in 'ab')), 2000)
         for more in ({'importance': 'low'}, {'importance': 'high'}, {}))
@@ -153,53 +155,68 @@ def test_the_highest_importance_is_never_refused():
 
 
 @pytest.mark.parametrize('keep', ['all', 'newest'])
-@pytest.mark.parametrize(('time', 'runs'), [(11, True), (20, False)])
-def test_less_important_work_leaves_room_for_the_next_important_job(time, runs, keep):
-    """It starts only if it ends before that job must start, or at long intervals."""
+def test_less_important_work_runs_when_nothing_more_important_is_ready(keep):
+    """However long it takes: nothing is kept free for what may come later."""
     sinks = results(case_of(
-        timer('low', 20, 20, time, importance='low', keep=keep), timer('high', 20, 12, 10)),
+        timer('low', 20, 20, 20, importance='low', keep=keep), timer('high', 20, 20, 10)),
         20_000)
-    assert sinks['high']['in_time'] >= (0.99 if runs else 0.85) * 1000
-    assert (sinks['low']['completed'] > 600) == runs
-    assert sinks['low']['completed'] >= 80  # one in about ten deadlines
+    assert sinks['low']['completed'] >= 450 and sinks['high']['completed'] >= 900
 
 
-def test_less_important_work_leaves_room_for_all_important_jobs():
-    """Those released together need the interpreter one after the other."""
-    sinks = results(case_of(
-        timer('low', 50, 50, 26, importance='low'), timer('first', 50, 20, 14),
-        timer('second', 50, 30, 14), workers=7), 20_000, holds=True)
-    assert min(sinks[name]['in_time'] for name in ('first', 'second')) >= 0.85 * 400
-
-
-@pytest.mark.parametrize('last', [0, 100])
-def test_room_is_left_for_one_release_after_the_last(last):
-    """If the source stops, less important work goes on although nothing else happens."""
-    case = case_of(timer('low', 40, 40, 30, importance='low'), timer('high', 20, 12, 10))
-    times = range(0, last + 1, 20)
-    load = case.load(1000)._replace(
-        times=[0, *(time * TICK for time in times)], dags=[0, *[1 for _ in times]],
-        jobs=[0, *range(len(times))])
-    events = case.events(simulated(case, load, 1000))
-    starts = [time for time, kind, _, dag, _, _ in events if (kind, dag) == ('start', 0)]
-    assert starts == [last + 20 + 2]  # as soon as the next job would be late
-
-
-def test_late_jobs_of_an_important_sink_refuse_others():
+def test_less_important_work_gives_way_to_a_late_important_sink():
     # There is room for both, but the first has the earlier deadline.
     low, high = (results(case_of(
         timer('first', 40, 10, 10, importance='low'),
         timer('second', 40, 20, 15, importance=importance)), 8000)['second']['in_time']
         for importance in ('low', 'high'))
-    assert low == 0 and high >= 0.97 * 200
+    assert low == 0 and high >= 0.8 * 200
 
 
-def test_a_sink_that_tolerates_no_further_miss_goes_first():
-    before, after = (results(case_of(
-        timer('plain', 20, 20, 20), timer('other', 20, 20, 12, **more)), 4000)
-        for more in ({}, {'tolerate': '1 of 10'}))
-    assert after['other']['completed'] > before['other']['completed']
-    assert after['plain']['completed'] < before['plain']['completed']
+def test_an_important_sink_shares_its_importance_with_what_it_reads():
+    """Over trigger and queue edges: topics that it takes, and callbacks of its node."""
+    found = importances(declaration([
+        {'node': '/camera', 'name': 'grab', 'timer': '100us', 'publishes': ['/image']},
+        {'node': '/logger', 'name': 'log', 'subscription': '/image', 'deadline': '90us',
+         'importance': 'low'},
+        {'node': '/detector', 'name': 'detect', 'subscription': '/image', 'deadline': '90us',
+         'publishes': ['/objects'], 'importance': 'low'},
+        {'node': '/odometry', 'name': 'step', 'timer': '50us', 'deadline': '50us'},
+        {'node': '/brake', 'name': 'listen', 'timer': '20us', 'deadline': '20us',
+         'importance': 'low'},
+        {'node': '/brake', 'name': 'brake', 'timer': '10us', 'deadline': '10us',
+         'reads': ['/objects', 'listen'], 'importance': 'high'}]))
+    names = {0: 'low', 1: 'normal', 2: 'high'}
+    assert [names[each] for each in found] == ['high', 'low', 'high', 'normal', 'high', 'high']
+
+
+def simulated_runs(late, **keys):
+    """Return when a timer of 40 ticks, deadline 100, starts next to two others with load 1."""
+    case = case_of(
+        timer('rare', 40, 100, 5, **keys), timer('a', 10, 10 + late, 5), timer('b', 10, 10, 5))
+    load = case.load(20_000)
+    events = case.events(simulated(case, load, 20_000))
+    return [time for time, kind, _, dag, _, _ in events if (kind, dag) == ('start', 0)]
+
+
+@pytest.mark.parametrize('keep', ['all', 'newest'])
+@pytest.mark.parametrize('importance', ['low', 'normal'])
+@pytest.mark.parametrize('late', [0, 1])
+def test_each_callback_runs_once_in_about_ten_deadlines(keep, importance, late):
+    """Also if each message is replaced before it is late: its age stays with the queue."""
+    starts = [0, *simulated_runs(late, keep=keep, importance=importance), 20_000]
+    assert max(after - before for before, after in zip(starts, starts[1:])) <= 12 * 100
+
+
+def test_a_measured_time_that_is_not_renewed_is_forgotten():
+    """Of a callback that runs no more, or seldom, the declared time counts again."""
+    scheduler = live(with_times(case_of(timer('a', 10, 10, 4), timer('b', 10, 10, 4))).task_set)
+    t, s = scheduler.tables, scheduler.state
+    slow = 1000 * TICK
+    for vertex, now in ((0, 0), (1, 0), (1, 90), (1, 100)):
+        note_time(t, s, vertex, slow, 0, now * TICK)
+    assert s.mean[:2] == [slow, slow] and s.reach_by[:2] == [10 * TICK - slow] * 2
+    note_time(t, s, 1, slow, 0, 101 * TICK)
+    assert s.mean[:2] == [4 * TICK, slow] and s.reach_by[0] == 6 * TICK
 
 
 # --- bursts --------------------------------------------------------------------------------------

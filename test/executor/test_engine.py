@@ -165,6 +165,88 @@ def test_late_messages_of_a_full_queue_are_dropped_with_the_oldest(on_late, drop
     assert (one.engine.dispatch(0, times[-1]) is last) == (on_late == 'demote')
 
 
+class Robot:
+    """
+    An engine that runs an important controller, a camera, and a detector that is slow at first.
+
+    The load is 15 % of the interpreter, but the first detections take 100 ms each.
+    """
+
+    def __init__(self, slow, depth, keep, others=0):
+        task_set = loads(graph(
+            controller='name: control, timer: 20ms, deadline: 20ms, importance: high',
+            camera='name: grab, timer: 60ms, publishes: [/image]',
+            detector=f'name: detect, subscription: /image, deadline: 100ms, keep: {keep}'))
+        self.engine = new_engine(task_set, 4, on_late='demote')
+        self.controller, self.camera = (entity_of(self.engine, task_set, i, 0) for i in (0, 1))
+        self.detector = entity_of(self.engine, task_set, 1, 1)
+        self.detector.depth = depth
+        for timer in (self.controller, self.camera):
+            timer.depth = source_depth(
+                self.engine.tables, self.engine.scheduler.state, self.engine.tables.dag_of[
+                    timer.source])
+        self.costs = {self.controller: (1 + others) * MS, self.camera: MS, self.detector: 5 * MS}
+        self.slow = slow
+        self.detections = []
+        for entity in self.costs:
+            entity.habit = GilHabit(True)
+
+    def run(self, end):
+        """Run callbacks one after the other, as they hold the interpreter."""
+        engine, now, due = self.engine, 0, {self.controller: 0, self.camera: 0}
+        while now < end:
+            self.fire(due, now)
+            work = engine.dispatch(0, now)
+            if work is None:
+                now = min(due.values())
+                continue
+            cost = self.costs[work.entity]
+            if work.entity is self.detector:
+                self.detections.append(now)
+                if len(self.detections) <= self.slow:
+                    cost = 100 * MS
+            start, now, origin = now, now + cost, work.origin
+            self.fire(due, now)
+            work.entity.habit.took(cost, cost)
+            engine.finished(work, start, now, now, 0, 0)
+            if work.entity is self.camera:
+                engine.arrived(Work(self.detector, print), origin, -1, -1, now)
+            engine.validate()
+        return self.detections
+
+    def fire(self, due, now):
+        for timer, period in ((self.controller, 20 * MS), (self.camera, 60 * MS)):
+            while due[timer] <= now:
+                self.engine.timer_due(Work(timer, print), due[timer], now)
+                due[timer] += period
+
+
+@pytest.mark.parametrize('slow', [1, 3, 10])
+@pytest.mark.parametrize(('depth', 'keep'), [(5, 'all'), (1, 'all'), (5, 'newest')])
+def test_a_callback_that_was_slow_at_first_runs_as_often_as_it_can(slow, depth, keep):
+    """It is less important than the controller, which was late because of it."""
+    robot = Robot(slow, depth, keep)
+    times = robot.run(6000 * MS)
+    assert len(times) >= 100 - 2 * slow
+    assert robot.controller.ran >= 300 - 5 * slow
+    assert robot.engine.scheduler.state.mean[2] <= 6 * MS  # the detector's
+
+
+@pytest.mark.parametrize(('depth', 'keep'), [(5, 'all'), (1, 'all'), (5, 'newest')])
+def test_no_queue_starves_a_callback_in_an_overload(depth, keep):
+    """The controller takes all the time; a message that is dropped passes its age on."""
+    times = Robot(0, depth, keep, others=21).run(20_000 * MS)
+    assert max(after - before for before, after in zip(times, times[1:])) <= 1300 * MS
+
+
+def test_the_first_executions_of_a_callback_do_not_count():
+    habit, found = GilHabit(True), []
+    for ms in (100, 80, 90, 5, 7):
+        habit.took(ms * MS, ms * MS)
+        found.append(habit.needs_ns)
+    assert found == [-1, -1, -1, 5 * MS, 6 * MS]
+
+
 def test_a_message_of_a_job_comes_to_a_queue_that_is_full_of_short_ones_without_a_job():
     """Those bypass the core."""
     one = OneUser(depth=2)
