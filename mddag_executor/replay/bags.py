@@ -12,7 +12,9 @@ Theory of operation
   the stamp at the beginning of its content, if its type begins with a `std_msgs/Header` or a time.
   The rest is not decoded.
 * A topic with a relative name (`AAA`) is the same as in the root namespace (`/AAA`).
-* Messages at impossible times (``trace.times``) are dropped and counted.
+* Messages at impossible times (``trace.times``) are dropped and counted, and so are those that are
+  more than a year away from most of the others: with `--use-sim-time` the recorder stamps messages
+  with 0 until the first `/clock`.
 * Damage loses the rest of its file, and is reported.
 """
 
@@ -22,27 +24,36 @@ from array import array
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing, contextmanager
 import io
+from itertools import compress
 import os
 from pathlib import Path
 import re
 import sqlite3
 import struct
 import tempfile
+from typing import Any, BinaryIO
 
 from mddag_executor.errors import InputError
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
+from mddag_executor.trace.blocks import other_kind
 from mddag_executor.trace.channels import Topic
 from mddag_executor.trace.errors import renamed, unreadable
-from mddag_executor.trace.times import joined, NEVER, stretches
+from mddag_executor.trace.times import FAR_NS, NEVER, stretches
+from msg_graph import GraphError
+from msg_graph.yamltext import parse_yaml, plain
+import numpy as np
 import zstandard
 
 _METADATA = 'metadata.yaml'
+_ABOUT = 'rosbag2_bagfile_information'
 _METADATA_LIMIT = 4 * 1024 * 1024
 _MCAP, _SQLITE, _ZSTD = b'\x89MCAP0\r\n', b'SQLite format 3\0', b'\x28\xb5\x2f\xfd'
 _REMEDY = 'give a folder with metadata.yaml that ros2 bag record wrote, or one of its files'
 _MESSAGE_LIMIT = 1 << 30    # bytes of a message, decompressed
 _BAG_FILE = re.compile(r'.*\.(mcap|db3)(\.zstd)?')
+_PIECE = 1 << 20
+_UNPACKED_LIMIT, _MOST_TIMES = 64 * 1024 * 1024, 1000      # what a whole file may become
 _STAMP = 12                 # bytes: encapsulation, seconds, nanoseconds
 _WINDOW = 128 * 1024 * 1024
 _STAMPED = {'std_msgs/msg/Header', 'builtin_interfaces/msg/Time'}
@@ -62,6 +73,12 @@ class Stamps:
         self.published = array('q')
         self.header = array('q')
         self.type = ''
+
+    def keep(self, first: int, last: int) -> None:
+        """Keep the messages that arrived from one time to another."""
+        kept = [first <= time <= last for time in self.arrival]
+        for name in ('arrival', 'published', 'header'):
+            setattr(self, name, array('q', compress(getattr(self, name), kept)))
 
 
 class Bag:
@@ -84,6 +101,8 @@ class Bag:
         self.name = name or self.path
         self._keep = keep
         self.count = 0
+        self._stated: int | None = None         # number of messages by metadata.yaml
+        self._times: list[Any] = []             # arrivals of all messages, by file
         self.topics: set[str] = set()
         self.stamps: dict[str, Stamps] = {}
         self.stretches: list[tuple[int, int]] = []
@@ -104,19 +123,48 @@ class Bag:
             self.warnings.append(
                 f'{self.name}: left out: {counted(self._impossible, "message")} at an impossible '
                 'time')
+        if self._stated is not None and self._stated != self.count and not self.warnings:
+            self.warnings.append(
+                f'{self.name}: it has {counted(self.count, "message")}, but metadata.yaml says '
+                f'{self._stated}: some may be missing')
+        self._leave_out_far_ones()
+
+    def _leave_out_far_ones(self) -> None:
+        """Find the stretches of time, without messages that are years from most of the others."""
+        times = np.sort(np.concatenate([np.empty(0, dtype=np.int64), *self._times]))
+        self._times.clear()
+        groups = np.split(times, np.flatnonzero(np.diff(times) > FAR_NS) + 1)
+        kept = max(groups, key=len)
+        self.stretches = stretches(kept)
+        if len(groups) == 1:
+            return
+        first = next(group[0] for group in groups if group is not kept)
+        self.warnings.append(
+            f'{self.name}: left out: {counted(len(times) - len(kept), "message")} more than a '
+            f'year from the others, the first at {first} ns (with --use-sim-time, messages are '
+            'stamped 0 until the first /clock)')
+        for stamps in self.stamps.values():
+            stamps.keep(int(kept[0]), int(kept[-1]))
 
     def _files(self) -> list[Path]:
         path = Path(self.path)
         if not os.path.isdir(path):
             return [path]
         names = _names_in(self.path)
-        if _METADATA in names:
-            return [path / name for name in _named_files(path / _METADATA)]
         found = sorted(path / name for name in names if _BAG_FILE.fullmatch(name))
+        what = f'{_METADATA} is missing'
+        if _METADATA in names:
+            try:
+                files, self._stated = _named_files(path / _METADATA)
+                return [path / name for name in files]
+            except BagError as error:
+                if not found:
+                    raise
+                what = f'{_METADATA}: {error.problem}'
         if not found:
             raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', _REMEDY)
         self.warnings.append(
-            f'{self.name}: metadata.yaml is missing (the recorder was killed): used '
+            f'{self.name}: {what} (the recorder was killed): used '
             f'{counted(len(found), "bag file")} from the folder')
         return found
 
@@ -135,6 +183,12 @@ class Bag:
             # immutable: reading must not write next to the file
             with closing(sqlite3.connect(
                     f'{file.absolute().as_uri()}?immutable=1', uri=True)) as storage:
+                # a view could take for ever
+                storage.execute('PRAGMA trusted_schema = OFF')
+                views = storage.execute(
+                    "SELECT name FROM sqlite_master WHERE type = 'view'").fetchall()
+                if views:
+                    raise ValueError('it has views, which ros2 bag does not write')
                 known = _topics_of(storage)
                 self.topics |= {_absolute(topic.name) for topic in known.values()}
                 wanted = [number for number, topic in known.items()
@@ -159,9 +213,10 @@ class Bag:
     def _look_through(self, times: Sequence[int]) -> None:
         """Store the arrivals of a file's messages."""
         self.count += len(times)
-        possible = [time for time in times if 0 <= time < NEVER]
+        every = np.asarray(times)
+        possible = every[(every >= 0) & (every < NEVER)].astype(np.int64)
         self._impossible += len(times) - len(possible)
-        self.stretches = joined([*self.stretches, *stretches(possible)])
+        self._times.append(possible)
 
     @property
     def start(self) -> int | None:
@@ -252,20 +307,31 @@ def _absolute(topic: str) -> str:
     return topic if topic.startswith('/') else f'/{topic}'
 
 
-def _named_files(metadata: Path) -> list[str]:
-    """Return the names of a bag's files; names outside of its folder are ignored."""
-    import yaml
+def _named_files(metadata: Path) -> tuple[list[str], int | None]:
+    """
+    Return the names of a bag's files, and how many messages they have, if that is stated.
+
+    Names outside of its folder are ignored.
+    """
     try:
         if metadata.stat().st_size > _METADATA_LIMIT:
             raise ValueError('it is too large')
-        about = yaml.safe_load(metadata.read_text(encoding='utf-8'))
-        names = about['rosbag2_bagfile_information']['relative_file_paths']
-        if not names:
+        about = plain(parse_yaml(metadata.read_text(encoding='utf-8'), str(metadata)))
+        if about is None:
+            raise ValueError('it is empty')
+        about = about.get(_ABOUT) if isinstance(about, dict) else None
+        about = about if isinstance(about, dict) else {}
+        names = about.get('relative_file_paths')
+        if not names or not isinstance(names, list) or not all(
+                isinstance(name, str) for name in names):
             raise ValueError('it names no file')
-        return [os.path.basename(name) for name in names]
-    except (OSError, ValueError, TypeError, KeyError, RecursionError, yaml.YAMLError) as error:
-        what = ' '.join(str(error).split())[:200]
-        raise BagError(str(metadata), f'this is no metadata of a bag ({what})', _REMEDY) from None
+        count = about.get('message_count')
+        return [os.path.basename(name) for name in names], (
+            int(count) if isinstance(count, str) and count.isdecimal() else None)
+    except (OSError, ValueError, GraphError) as error:
+        what = error.problem if isinstance(error, GraphError) else ' '.join(str(error).split())
+        raise BagError(
+            str(metadata), f'this is no metadata of a bag ({what[:200]})', _REMEDY) from None
 
 
 @contextmanager
@@ -283,7 +349,7 @@ def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
         target = Path(folder, 'bag')
         try:
             with open(file, 'rb') as packed, open(target, 'wb') as out:
-                zstandard.ZstdDecompressor(max_window_size=_WINDOW).copy_stream(packed, out)
+                _unpack(packed, out, file)
         except zstandard.ZstdError as error:
             raise BagError(str(file), f'cannot be unpacked ({error})', _REMEDY) from None
         except OSError as error:
@@ -293,13 +359,28 @@ def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
         yield target, _kind(target)
 
 
+def _unpack(packed: BinaryIO, out: BinaryIO, file: Path) -> None:
+    """Unpack a file; raise BagError if it is made to fill the disk."""
+    most = max(_UNPACKED_LIMIT, _MOST_TIMES * os.fstat(packed.fileno()).st_size)
+    size = 0
+    with zstandard.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(
+            packed, read_across_frames=True) as reader:
+        while piece := reader.read(_PIECE):
+            size += len(piece)
+            if size > most:
+                raise BagError(
+                    str(file), f'unpacked it is more than {_MOST_TIMES} times as large, as no '
+                    'recording is', _REMEDY)
+            out.write(piece)
+
+
 def _kind(file: Path) -> bytes:
     """Return the first bytes of a bag file, which say its kind."""
     try:
         if not file.is_file():
             raise BagError(str(file), 'is no file', _REMEDY)
         with open(file, 'rb') as stream:
-            head = stream.read(16)
+            head = stream.read(32)
     except OSError as error:
         raise BagError(str(file), f'cannot be read ({error.strerror})', _REMEDY) from None
     except ValueError:
@@ -307,7 +388,7 @@ def _kind(file: Path) -> bytes:
     for kind in (_MCAP, _SQLITE, _ZSTD):
         if head.startswith(kind):
             return kind
-    raise BagError(str(file), 'is no rosbag2 recording', _REMEDY)
+    raise BagError(str(file), *(other_kind(head) or ('is no rosbag2 recording', _REMEDY)))
 
 
 def _unpacked_message(data: bytes, size: int) -> bytes:

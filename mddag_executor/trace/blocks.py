@@ -13,6 +13,8 @@ Theory of operation
    an unchecked length.
 4. A message index follows its chunk.  Elsewhere it shows that the opcode of a chunk has changed.
 5. A chunk's CRC of 0 means no CRC (MCAP specification).  Records outside of chunks have no CRC.
+6. Records may have more bytes than is known of them; these are ignored (MCAP specification).
+7. The content of a chunk is read when it is unpacked, so a chunk that is not wanted costs nothing.
 """
 
 from __future__ import annotations
@@ -21,13 +23,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 import os
+import struct
 from typing import BinaryIO, NamedTuple
 import zlib
 
 import lz4.frame
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Header, Statistics
+from mcap.records import Channel, Header, Statistics
 from mddag_executor.trace import records
 from mddag_executor.trace.errors import TraceError
 import zstandard
@@ -38,7 +41,14 @@ _PLAIN_BLOCK = 256 * 1024
 _LZ4_PIECE = 1 << 20
 NO_MEMORY = 'a chunk does not fit into the memory'
 _WRONG_SIZE = 'a chunk does not have the size that its head says'
+_SHORTER = 'the file has become shorter'
 _PLAIN = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+_USED = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS)
+_SUMMARY = (*_USED, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX,
+            Opcode.SUMMARY_OFFSET)
+_PRIVATE = 0x80     # opcodes from here on belong to others
+_CHUNK_HEAD = 256   # bytes; the name of the compression is short
+_CRC_PIECE = 1 << 20
 _FOOTER_SIZE = records.RECORD.size + records.FOOTER_CONTENT.size + len(records.MAGIC)
 _REMEDY = 'give a trace written by this program or another MCAP recording'
 
@@ -71,6 +81,31 @@ class Content(ReadDataStream):
         return self._stream.read(length)
 
 
+class ChunkHead(NamedTuple):
+    """
+    The head of a chunk, and where its packed records are.
+
+    :ivar start, end: the times of its first and last message.
+    :ivar size: of the records, unpacked; ``crc``: of these, or 0.
+    """
+
+    start: int
+    end: int
+    size: int
+    crc: int
+    compression: str
+    file: int
+    position: int
+    length: int
+
+    def data(self) -> bytes:
+        """Return the packed records; ValueError: the file has become shorter."""
+        data = os.pread(self.file, self.length, self.position)
+        if len(data) < self.length:
+            raise ValueError(_SHORTER)
+        return data
+
+
 @dataclass
 class Block:
     """
@@ -78,19 +113,24 @@ class Block:
 
     :ivar offset: position of its first byte in the file.
     :ivar indexes: contents of its message indexes.
-    :ivar chunk: the chunk; its data is packed.
+    :ivar chunk: the head of the chunk.
     :ivar plain: records outside of chunks.
     """
 
     offset: int
     indexes: list[bytes]
-    chunk: Chunk | None = None
+    chunk: ChunkHead | None = None
     plain: bytearray = field(default_factory=bytearray)
 
     @property
     def size(self) -> int:
         """Return the size of its records, unpacked."""
-        return len(self.plain) if self.chunk is None else int(self.chunk.uncompressed_size)
+        return len(self.plain) if self.chunk is None else self.chunk.size
+
+    @property
+    def is_checked(self) -> bool:
+        """Return whether a CRC says that its records are what was written."""
+        return self.chunk is not None and self.chunk.crc != 0
 
     def unpack(self, room: memoryview) -> None:
         """
@@ -102,30 +142,51 @@ class Block:
             room[:] = self.plain
             return
         try:
-            _decompress(self.chunk.data, self.chunk.compression, room)
+            _decompress(self.chunk.data(), self.chunk.compression, room)
         except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
             raise Damage('a chunk cannot be decompressed', self.offset) from None
         except ValueError as error:
             raise Damage(str(error), self.offset) from None
-        if self.chunk.uncompressed_crc and zlib.crc32(room) != self.chunk.uncompressed_crc:
+        if self.is_checked and zlib.crc32(room) != self.chunk.crc:
             raise Damage('the CRC of a chunk is wrong', self.offset)
 
 
 class Summary(NamedTuple):
-    """The contents of a file according to its summary section."""
+    """
+    The contents of a file according to its summary section.
+
+    :ivar schemas, channels: contents of the records of all schemas and channels.
+    """
 
     messages: int
     chunks: int
     topics: frozenset[str]
+    schemas: tuple[bytes, ...]
+    channels: tuple[bytes, ...]
 
 
-def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
+# By the first bytes of a file: what it is, and what to do.
+_OTHERS = (
+    (b'version https://git-lfs', 'is a pointer to a file in Git LFS, not the file itself',
+     "get the file with 'git lfs pull'"),
+    (b'#ROSBAG V', 'is a bag of ROS 1', "convert it, as with 'rosbags-convert'"),
+)
+
+
+def other_kind(head: bytes) -> tuple[str, str] | None:
+    """Return what a file is, and what to do, by its first 32 bytes; None: unknown."""
+    return next(((what, remedy) for magic, what, remedy in _OTHERS if head.startswith(magic)),
+                None)
+
+
+def open_data(stream: BinaryIO, path: str, size: int) -> tuple[int, str]:
     """Check the beginning of a file; return the start of its data section, and its writer."""
-    magic = stream.read(len(records.MAGIC))
-    if not magic:
+    start = stream.read(32)
+    if not start:
         raise TraceError(path, 'is empty', _REMEDY)
-    if magic != records.MAGIC:
-        raise TraceError(path, 'is no MCAP file', _REMEDY)
+    if not start.startswith(records.MAGIC):
+        raise TraceError(path, *(other_kind(start) or ('is no MCAP file', _REMEDY)))
+    stream.seek(len(records.MAGIC))
     head = stream.read(records.RECORD.size)
     if len(head) == records.RECORD.size:
         opcode, length = records.RECORD.unpack(head)
@@ -134,10 +195,24 @@ def open_data(stream: BinaryIO, path: str) -> tuple[int, str]:
             library: str = Header.read(content).library
         except ValueError:
             opcode = 0
+        end = len(records.MAGIC) + len(head) + int(length)
         # A wrong length could skip the first chunk.
-        if opcode == Opcode.HEADER and content.count == length:
-            return len(magic) + len(head) + int(length), library
+        if opcode == Opcode.HEADER and (
+                content.count == length or _is_record(stream, end, size)):
+            return end, library
     raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
+
+
+def _is_record(stream: BinaryIO, position: int, size: int) -> bool:
+    """Return whether a whole record of the data section is at a position."""
+    stream.seek(min(position, size))
+    head = stream.read(records.RECORD.size)
+    if len(head) < records.RECORD.size:
+        return False
+    opcode, length = records.RECORD.unpack(head)
+    known = (*_PLAIN, Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA, Opcode.DATA_END)
+    fits: bool = position + len(head) + length <= size
+    return fits and (opcode in known or opcode >= _PRIVATE)
 
 
 def blocks(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
@@ -164,7 +239,7 @@ def blocks(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
                 yield block
             block = None
             if opcode == Opcode.CHUNK:
-                block = Block(offset, [], chunk=_chunk(content, offset))
+                block = Block(offset, [], chunk=_chunk(stream.fileno(), offset, content))
             elif plain:
                 block = Block(offset, [], plain=bytearray(plain))
     except Damage:
@@ -188,31 +263,52 @@ def _records(file: int, position: int, size: int) -> Iterator[tuple[int, int, by
         if opcode in (0, Opcode.HEADER, Opcode.FOOTER):     # 0: a tail of zeros
             raise Damage('a record is where it cannot be', position)
         if opcode == Opcode.DATA_END:
+            _check_tail(file, start + length, size)
             return
         content = b''
         if opcode in (*_PLAIN, Opcode.CHUNK, Opcode.MESSAGE_INDEX):
             if length > MAX_CHUNK:
                 raise Damage('a record is too large', position)
+            wanted = min(length, _CHUNK_HEAD) if opcode == Opcode.CHUNK else length
             try:
-                content = os.pread(file, length, start)
+                content = os.pread(file, wanted, start)
             except MemoryError:
                 raise Damage(NO_MEMORY, position) from None
-            if len(content) < length:
-                raise Damage('the file has become shorter', position)
+            if len(content) < wanted:
+                raise Damage(_SHORTER, position)
         yield opcode, position, content
         position = start + length
 
 
-def _chunk(content: bytes, offset: int) -> Chunk:
-    """Return a chunk; raise Damage if its head is wrong."""
-    stream = Content(content)
+def _check_tail(file: int, position: int, size: int) -> None:
+    """Check that a file ends behind its footer; another one may have been appended to it."""
+    while position + records.RECORD.size <= size:
+        opcode, length = records.RECORD.unpack(os.pread(file, records.RECORD.size, position))
+        position += records.RECORD.size + length
+        if opcode == Opcode.FOOTER:
+            position += len(records.MAGIC)
+            if position < size:
+                raise Damage('the file goes on behind its end, as if another one had been '
+                             'appended to it', position)
+            return
+        if opcode not in _SUMMARY and opcode < _PRIVATE:
+            return      # damage, which reading the summary reports
+
+
+def _chunk(file: int, offset: int, content: bytes) -> ChunkHead:
+    """Return the head of a chunk from the first bytes of its content; Damage: it is wrong."""
+    stream, fixed = Content(content), struct.Struct('<QQQI')
+    begin = offset + records.RECORD.size
     try:
-        chunk: Chunk = Chunk.read(stream)
-    except (ValueError, MemoryError) as error:
-        raise Damage(str(error) or NO_MEMORY, offset) from None
-    if stream.count < len(content) or chunk.uncompressed_size > MAX_CHUNK:
+        start, end, size, crc = fixed.unpack(stream.read(fixed.size))
+        compression = stream.read(stream.read4()).decode()
+        length = stream.read8()
+    except ValueError as error:
+        raise Damage(str(error), offset) from None
+    record, = struct.unpack('<Q', os.pread(file, 8, offset + 1))
+    if stream.count + length > record or size > MAX_CHUNK:
         raise Damage('the lengths in the head of a chunk are wrong', offset)
-    return chunk
+    return ChunkHead(start, end, size, crc, compression, file, begin + stream.count, length)
 
 
 def _decompress(data: bytes, compression: str, room: memoryview) -> None:
@@ -262,19 +358,50 @@ def read_summary(stream: BinaryIO, size: int) -> Summary | None:
         return None
     if start > footer_start:
         raise ValueError('the summary is behind the footer')
-    stream.seek(start)
-    data = stream.read(footer_start - start)
-    if crc and crc != zlib.crc32(footer[:records.RECORD.size + 16], zlib.crc32(data)):
+    found = _summary_records(stream.fileno(), start, footer_start)
+    if crc and crc != _crc(stream, start, footer_start, footer[:records.RECORD.size + 16]):
         raise ValueError('the CRC of the summary is wrong')
-    content = Content(data)
-    statistics, topics = None, set()
-    while content.count < len(data):
-        opcode, length = records.RECORD.unpack(content.read(records.RECORD.size))
-        record = Content(content.read(length))
-        if opcode == Opcode.STATISTICS:
-            statistics = Statistics.read(record)
-        elif opcode == Opcode.CHANNEL:
-            topics.add(Channel.read(record).topic)
+    statistics = found.get(Opcode.STATISTICS)
     if statistics is None:
         return None
-    return Summary(statistics.message_count, statistics.chunk_count, frozenset(topics))
+    counts, channels = Statistics.read(Content(statistics[-1])), found.get(Opcode.CHANNEL, [])
+    return Summary(
+        counts.message_count, counts.chunk_count,
+        frozenset(Channel.read(Content(each)).topic for each in channels),
+        tuple(found.get(Opcode.SCHEMA, [])), tuple(channels))
+
+
+def _summary_records(file: int, position: int, end: int) -> dict[int, list[bytes]]:
+    """
+    Return the contents of the used records of a summary by opcode.
+
+    :raises ValueError: if these records do not fill the space from a position to an end.
+    """
+    found: dict[int, list[bytes]] = {}
+    size = 0
+    while position < end:
+        head = os.pread(file, records.RECORD.size, position)
+        if len(head) < records.RECORD.size:
+            raise ValueError(_SHORTER)
+        opcode, length = records.RECORD.unpack(head)
+        start, position = position + len(head), position + len(head) + length
+        if position > end or (opcode not in _SUMMARY and opcode < _PRIVATE):
+            raise ValueError('there is no summary where it should be')
+        if opcode in _USED:
+            size += length
+            if size > MAX_CHUNK:
+                raise ValueError('the summary is too large')
+            found.setdefault(opcode, []).append(os.pread(file, length, start))
+    return found
+
+
+def _crc(stream: BinaryIO, start: int, end: int, rest: bytes) -> int:
+    """Return the CRC of a part of a file and the rest."""
+    crc = 0
+    stream.seek(start)
+    while start < end:
+        piece = stream.read(min(end - start, _CRC_PIECE))
+        if not piece:
+            raise ValueError(_SHORTER)
+        crc, start = zlib.crc32(piece, crc), start + len(piece)
+    return zlib.crc32(rest, crc)

@@ -74,6 +74,8 @@ class Channels:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._size = 0
+        self._known_schemas: set[bytes] = set()         # contents of their records
+        self._known_channels: set[bytes] = set()
         #: The topics of the channels.
         self.topics: dict[int, Topic] = {}
         #: Channels whose messages are skipped.
@@ -87,13 +89,20 @@ class Channels:
 
     def add_schema(self, content: bytes) -> None:
         """Add the content of a schema record; ValueError: malformed, or redefines a known one."""
+        if content in self._known_schemas:      # most files repeat them in each chunk
+            return
         schema = Schema.read(Content(content))
         self._keep(self._schemas, schema, content)
+        self._known_schemas.add(content)
 
     def add_channel(self, content: bytes) -> None:
         """Add the content of a channel record; ValueError: malformed, or redefines a known one."""
+        if content in self._known_channels:
+            return
         channel = Channel.read(Content(content))
+        channel.metadata.clear()        # such as QoS: no message is read in another way by it
         self._keep(self._channels, channel, content)
+        self._known_channels.add(content)
         number = channel.id
         if number in self.topics:
             return
@@ -110,6 +119,11 @@ class Channels:
             self._decode(number, name, _fields_of(topic))
         except ValueError as error:
             self._decoders[number] = str(error)
+
+    def undecodable(self, number: int) -> str | None:
+        """Return why no message of a channel can be decoded; None: it can."""
+        decoder = self._decoders.get(number, UNDEFINED)
+        return decoder if isinstance(decoder, str) else None
 
     def decoder(self, number: int) -> Decoder:
         """

@@ -77,7 +77,7 @@ class TraceReader:
         weakref.finalize(self, stream.close)
         try:
             size = self._size = os.fstat(stream.fileno()).st_size
-            self._start, library = open_data(stream, self.path)
+            self._start, library = open_data(stream, self.path, size)
             #: Whether this program wrote the file.
             self.written_here = library == LIBRARY
             #: Whether the summary at the end is there and sound; or a finished file has none.
@@ -150,7 +150,7 @@ class TraceReader:
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
         """Yield the undecoded messages of some topics, in the order of the file."""
         with self._reading(Channels(set(), True)) as reading:
-            yield from reading.messages_of(topics, self.times)
+            yield from reading.messages_of(topics, self.times, self._summary)
 
     @contextmanager
     def _reading(self, channels: Channels) -> Iterator[Reading]:

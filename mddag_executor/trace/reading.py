@@ -13,9 +13,12 @@ Theory of operation
 3. In the order of time all events are in memory.  Events of equal time are in the order of the
    file.
 4. A block is used only if all blocks before it are valid.  So the beginning of a damaged
-   recording is used.  ``damage`` has the damage; it is not raised.
+   recording is used.  ``damage`` has the damage; it is not raised.  If the records of a block are
+   wrong, those before it are used, unless the block is a chunk without CRC.
 5. An undecodable message in a valid block is skipped and counted.  In the order of time, events
    before 1970 or after 2116 are skipped, too: a simulation of them would never end.
+6. If messages of some topics are wanted, a chunk is only unpacked if its message indexes name one
+   of these, or a channel that the summary does not have.  Its times are then those of the indexes.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ from typing import Any, BinaryIO, NamedTuple
 from mcap.opcode import Opcode
 from mddag_executor.text import counted
 from mddag_executor.trace import records
-from mddag_executor.trace.blocks import blocks, Damage, NO_MEMORY
+from mddag_executor.trace.blocks import Block, blocks, Damage, NO_MEMORY, Summary
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic, UNDEFINED
 from mddag_executor.trace.events import Batch, Event, Ints, rows_at, Table, with_fields
@@ -42,6 +45,8 @@ _HEAD = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2')])
 """The begin of a message's record; its times follow after four bytes."""
 _TIMES_AT, _TIMES = 15, np.dtype([('log_time', '<u8'), ('publish_time', '<u8')])
 _CONTENT = records.RECORD.size
+_ROW = 16               # records that are compared at once; then eight times as many
+_MOST_OTHERS = 100_000  # records in a block that are neither messages nor definitions
 _LEAST = _CONTENT + records.MESSAGE_HEAD.size       # bytes of a message's record
 _FIELDS = _LEAST + len(ENCAPSULATION)       # bytes before the fields of an event
 _PLAIN = int.from_bytes(ENCAPSULATION[:2], 'little')
@@ -73,6 +78,13 @@ class _Loaded(NamedTuple):
     channels: Any
 
 
+class _Defect(NamedTuple):
+    """A wrong record in a block, and its position there."""
+
+    what: str
+    position: int
+
+
 class Reading:
     """
     One pass over a file: its data, and the unusable parts.
@@ -94,6 +106,9 @@ class Reading:
         self._left_out: list[int] = []      # impossible times
         self._place = 0             # of the next batch in the order of the file
         self._buffer = bytearray()  # of a batch
+        #: The channels of which messages are wanted, of all known ones; None: all are wanted.
+        self._wanted: tuple[set[int], set[int]] | None = None
+        self._skipped: list[Any] = []       # times of messages in chunks that are not unpacked
 
     def by_file(self) -> Iterator[Batch]:
         """Yield the events in the order of the file."""
@@ -108,9 +123,12 @@ class Reading:
             self._left_out = [event[1] for event in found if not 0 <= event[1] < NEVER]
         yield from sorted(possible, key=itemgetter(1))
 
-    def messages_of(self, topics: Collection[str], times: array[int]) -> Iterator[Message]:
+    def messages_of(
+        self, topics: Collection[str], times: array[int], summary: Summary | None
+    ) -> Iterator[Message]:
         """Yield the messages of some topics; add the times of all messages to ``times``."""
         known = self._channels.topics
+        self._choose(topics, summary)
         for data, at, lengths, channels in self._messages():
             heads = rows_at(data, _TIMES, at + _TIMES_AT)
             times.frombytes(heads['log_time'].tobytes())
@@ -123,6 +141,43 @@ class Reading:
                     heads[wanted].tolist()):
                 yield Message(known[channel], log_time, publish_time,
                               bytes(data[start + _LEAST:start + _CONTENT + length]))
+        for each in self._skipped:
+            times.frombytes(each.tobytes())
+
+    def _choose(self, topics: Collection[str], summary: Summary | None) -> None:
+        """Choose the channels of topics; without a sound summary all messages are read."""
+        if summary is None or not summary.channels:
+            return
+        try:
+            for schema in summary.schemas:
+                self._channels.add_schema(schema)
+            for channel in summary.channels:
+                self._channels.add_channel(channel)
+        except ValueError:
+            return      # the data section has the last word
+        known = self._channels.topics
+        self._wanted = {n for n in known if known[n].name in topics}, set(known)
+
+    def _is_skipped(self, block: Block) -> bool:
+        """Return whether no message of a block is wanted, and keep their times then."""
+        if self._wanted is None or block.chunk is None or not block.indexes:
+            return False
+        wanted, known = self._wanted
+        channels = {int.from_bytes(index[:2], 'little') for index in block.indexes}
+        if channels & wanted or channels - known:
+            return False
+        try:
+            times = np.concatenate([
+                np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD)['time']
+                for index in block.indexes])
+        except ValueError:      # not a number of whole entries
+            return False
+        if len(times) and not block.chunk.start <= times.min() <= times.max() <= block.chunk.end:
+            return False
+        self._skipped.append(times)
+        self.chunks += 1
+        self.messages += len(times)
+        return True
 
     # --- positions of messages -------------------------------------------------------------------
 
@@ -132,6 +187,8 @@ class Reading:
         size = 0
         try:
             for block in self._blocks:
+                if self._is_skipped(block):
+                    continue
                 if size and size + block.size > _BATCH_BYTES:
                     yield _Loaded(self._buffer, *map(np.concatenate, zip(*places)))
                     self._place += size
@@ -140,14 +197,16 @@ class Reading:
                     self._buffer = bytearray(max(block.size, _BATCH_BYTES))
                 room = memoryview(self._buffer)[size:size + block.size]
                 block.unpack(room)
-                try:
-                    at, lengths, channels = self._located(room, block.indexes)
-                except ValueError as error:
-                    raise Damage(str(error), block.offset) from None
-                self.chunks += block.chunk is not None
+                at, lengths, channels, defect = self._located(room, block.indexes)
+                if defect is not None and block.chunk is not None and not block.is_checked:
+                    raise Damage(defect.what, block.offset)
+                self.chunks += block.chunk is not None and defect is None
                 self.messages += len(at)
                 places.append((at + size, lengths, channels))
                 size += block.size
+                if defect is not None:
+                    raise Damage(defect.what, block.offset + (
+                        defect.position if block.chunk is None else 0))
         except Damage as damage:
             self.damage = Damage(damage.what, damage.offset)    # no traceback: it keeps the data
         except MemoryError:
@@ -157,40 +216,71 @@ class Reading:
 
     def _located(
         self, data: memoryview, indexes: Sequence[bytes]
-    ) -> tuple[Ints, Ints, Any]:
+    ) -> tuple[Ints, Ints, Any, _Defect | None]:
         """
         Return positions, lengths and channels of the messages in a block; read its definitions.
 
-        :raises ValueError: if the records are invalid.
+        Those of messages before the first wrong record, which is also returned.
         """
         at, lengths, channels = _indexed(data, indexes)
         # definitions are between the messages; without usable indexes all messages are, too
         ends, begins = np.append(0, at + _CONTENT + lengths), np.append(at, len(data))
         gaps = np.flatnonzero(ends < begins)
-        found = [position for begin, until in zip(ends[gaps].tolist(), begins[gaps].tolist())
-                 for position in self._walk(data, begin, until)]
-        if found:
-            at = np.sort(np.append(at, found)).astype(np.int64)
+        found: list[Ints] = []
+        defect = None
+        for begin, until in zip(ends[gaps].tolist(), begins[gaps].tolist()):
+            defect = self._walk(data, begin, until, found)
+            if defect is not None:
+                at = at[at < defect.position]
+                break
+        if found or defect is not None:
+            at = np.sort(np.concatenate([at, *found])).astype(np.int64)
             heads = rows_at(data, _HEAD, at)
             lengths, channels = heads['length'].astype(np.int64), heads['channel']
-        return at, lengths, channels
+        return at, lengths, channels, defect
 
-    def _walk(self, data: memoryview, position: int, end: int) -> Iterator[int]:
-        """Yield the positions of messages between two positions; read definitions."""
-        while position < end:
+    def _walk(
+        self, data: memoryview, position: int, end: int, found: list[Ints]
+    ) -> _Defect | None:
+        """
+        Add the positions of messages between two positions to ``found``; read definitions.
+
+        Return the first wrong record.
+        """
+        others, single = 0, list[int]()
+        what = None
+        while position < end and what is None:
             opcode, length = data[position], data[position + 1:position + _CONTENT]
-            after = position + _CONTENT + int.from_bytes(length, 'little')
-            if after > end:
-                raise ValueError('the records of a chunk do not fit into it')
-            if opcode == Opcode.MESSAGE:
-                if after - position < _LEAST:
-                    raise ValueError('a message is shorter than its head')
-                yield position
-            elif opcode == Opcode.SCHEMA:
-                self._channels.add_schema(bytes(data[position + _CONTENT:after]))
-            elif opcode == Opcode.CHANNEL:
-                self._channels.add_channel(bytes(data[position + _CONTENT:after]))
-            position = after
+            size = _CONTENT + int.from_bytes(length, 'little')
+            if position + size > end:
+                what = 'the records of a chunk do not fit into it'
+            elif opcode == Opcode.MESSAGE:
+                if size < _LEAST:
+                    what = 'a message is shorter than its head'
+                    break
+                single.append(position)
+                row = _row(data, position, size, end)
+                if len(row):
+                    found.append(row)
+                    position = int(row[-1])
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                content = bytes(data[position + _CONTENT:position + size])
+                add = self._channels.add_schema if opcode == Opcode.SCHEMA else \
+                    self._channels.add_channel
+                try:
+                    add(content)
+                except ValueError as error:
+                    what = str(error)
+            elif opcode == 0:
+                what = 'a record is where it cannot be'
+            else:
+                others += 1
+                if others > _MOST_OTHERS:
+                    what = 'a chunk is full of records that do not belong there'
+            position += size if what is None else 0
+        if single:
+            found.append(np.array(single, dtype=np.int64))
+        return None if what is None else _Defect(what, position)
 
     # --- contents of messages --------------------------------------------------------------------
 
@@ -201,6 +291,10 @@ class Reading:
             if channel in self._channels.passed_over:
                 continue
             mine = np.flatnonzero(loaded.channels == channel)
+            reason = self._channels.undecodable(channel)
+            if reason is not None:
+                self._undecoded[f'{self._named(channel)}: {reason}'] += len(mine)
+                continue
             at, lengths = loaded.at[mine], loaded.lengths[mine] + _CONTENT
             fixed = self._channels.fixed.get(channel)
             if fixed is not None:
@@ -227,10 +321,12 @@ class Reading:
             head, unpack = self._channels.decoder(channel)
             return head + unpack(message[_FIELDS:])
         except (ValueError, struct.error) as error:
-            topic = self._channels.topics.get(channel)
-            name = f'channel {channel}' if topic is None else topic.name
-            self._undecoded[f'{name}: {error}'] += 1
+            self._undecoded[f'{self._named(channel)}: {error}'] += 1
             return None
+
+    def _named(self, channel: int) -> str:
+        topic = self._channels.topics.get(channel)
+        return f'channel {channel}' if topic is None else topic.name
 
     def impossible_times(self) -> str | None:
         """Return the warning about events with impossible times, None if there are none."""
@@ -247,6 +343,23 @@ class Reading:
         total = sum(self._undecoded.values())
         return (f'{self._path}: left out {counted(total, "message")} that cannot be decoded, '
                 f'most of them ({count}) of {reason}')
+
+
+def _row(data: memoryview, position: int, size: int, end: int) -> Ints:
+    """Return the positions of the records behind one that begin in the same way, one by one."""
+    most = (end - position) // size - 1
+    first = bytes(data[position:position + _CONTENT])
+    count, wanted = 0, _ROW
+    while count < most and data[position + (count + 1) * size:][:_CONTENT] == first:
+        wanted = min(wanted, most - count)
+        heads = np.ndarray((wanted, _CONTENT), 'u1', data, position + (count + 1) * size,
+                           (size, 1))
+        different = np.flatnonzero((heads != heads[0]).any(axis=1))
+        if len(different):
+            count += int(different[0])
+            break
+        count, wanted = count + wanted, wanted * 8
+    return position + size * np.arange(1, count + 1, dtype=np.int64)
 
 
 def _indexed(data: memoryview, indexes: Sequence[bytes]) -> tuple[Ints, Ints, Any]:

@@ -9,7 +9,6 @@ times are used as they are.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,20 +23,9 @@ def credible(stamp: Any, arrival: Any) -> Any:
     return (stamp > 0) & (arrival - stamp < FAR_NS)
 
 
-def joined(several: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return ranges in the order of time, with adjacent ones joined."""
-    found: list[tuple[int, int]] = []
-    for start, end in sorted(several):
-        if found and start - found[-1][1] <= GAP_NS:
-            start, until = found.pop()
-            end = max(end, until)
-        found.append((start, end))
-    return found
-
-
-def stretches(times: Sequence[int]) -> list[tuple[int, int]]:
+def stretches(times: Any) -> list[tuple[int, int]]:
     """Return the ranges of times without a gap of more than `GAP_NS`, in the order of time."""
-    array = np.sort(np.array(times, dtype=np.int64))
+    array = np.sort(np.asarray(times, dtype=np.int64))
     if not len(array):
         return []
     return [(int(group[0]), int(group[-1]))

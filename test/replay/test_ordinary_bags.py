@@ -8,18 +8,20 @@ import re
 import shutil
 import sqlite3
 
+from mcap.writer import Writer as McapWriter
 from mddag_executor import open_recording
 from mddag_executor.errors import InputError
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
 from mddag_executor.replay.bags_reschedule import read_bag, reschedule_bag
 from mddag_executor.simulate import START
-from mddag_executor.trace import times, TraceError, TraceFile
+from mddag_executor.trace import blocks, times, TraceError, TraceFile
 from msg_graph import loads
 import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
+import zstandard
 
 MS = 1_000_000
 S = 1_000 * MS
@@ -270,7 +272,7 @@ def test_hostile_files(tmp_path):
                        (folder, 'there is neither metadata.yaml nor a bag file')):
         refuse(path, says)
     files = 'rosbag2_bagfile_information: {relative_file_paths: %s}'
-    for metadata in ('', '[', '- 1', files % '[]', files % '[1]', '\x00', '[' * 900,
+    for metadata in ('', '[', '- 1', files % '[]', files % '[[]]', '\x00', '[' * 900,
                      '!!python/object:os.system x'):
         (folder / 'metadata.yaml').write_text(metadata)
         refuse(folder, r'/metadata.yaml: this is no metadata of a bag \(')
@@ -345,3 +347,76 @@ def test_a_pause_has_no_jobs_of_timers(tmp_path):
     assert 'none in 1 pause of over a minute' in outcome.notes[1]
     tick = outcome.result()['dags']['/control']['jobs']
     assert tick <= 2 * (N * 25 * MS // 2 // TIMER + 1)
+
+
+@pytest.mark.parametrize('storage', [MCAP, SQLITE])
+def test_messages_that_are_years_from_the_others_are_left_out(tmp_path, storage):
+    """Until the first /clock, a recorder with --use-sim-time stamps messages with 0."""
+    sound = rescheduled(tmp_path / 'sound', ARRIVALS[2:], storage)
+    outcome = rescheduled(tmp_path / 'odd', [0, 0, *ARRIVALS[2:]], storage)
+    warning, = outcome.warnings
+    assert ': left out: 2 messages more than a year from the others, the first at 0 ns (' in \
+        warning
+    assert outcome.result()['dags'] == sound.result()['dags']
+    assert outcome.result()['duration_ns'] == sound.result()['duration_ns']
+    simulated = rescheduled(tmp_path / 'simulated', [time - BEGIN for time in ARRIVALS], storage)
+    assert simulated.warnings == []
+
+
+@pytest.mark.parametrize('metadata', ['', 'rosbag2_bagfile_information:\n', '[' * 100_000])
+def test_damaged_metadata_is_as_if_it_were_missing(tmp_path, metadata):
+    path = write_bag(tmp_path / 'bag')
+    (path / 'metadata.yaml').write_text(metadata)
+    warning, = (outcome := reschedule_bag(path, TASK_SET)).warnings
+    assert 'metadata.yaml: this is no metadata of a bag (' in warning
+    assert 'NoneType' not in warning and warning.endswith(': used 1 bag file from the folder')
+    assert outcome.result()['dags']['/lidar']['jobs'] == 10
+
+
+def test_messages_that_metadata_has_and_the_files_have_not_are_said(tmp_path):
+    path = write_bag(tmp_path / 'bag')
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('message_count: 11', 'message_count: 500'))
+    warning, = reschedule_bag(path, TASK_SET).warnings
+    assert warning.endswith(
+        ': it has 11 messages, but metadata.yaml says 500: some may be missing')
+
+
+@pytest.mark.parametrize('topics, unpacked', [((), 0), (('/points',), 1), (('/chatter',), 6)])
+def test_chunks_without_the_topics_are_not_unpacked(tmp_path, monkeypatch, topics, unpacked):
+    """The times of their messages are in the index."""
+    path, calls = tmp_path / 'a.mcap', []
+    with open(path, 'wb') as file:
+        writer = McapWriter(file, chunk_size=400)
+        writer.start('ros2', '')
+        schema = writer.register_schema(STRING, 'ros2msg', b'string data')
+        channels = [writer.register_channel(topic, 'cdr', schema)
+                    for topic in ('/chatter', '/points')]
+        for i, arrival in enumerate(ARRIVALS[:20]):
+            writer.add_message(channels[i == 7], arrival, bytes(100), arrival)
+        writer.finish()
+    decompress = blocks._decompress
+    monkeypatch.setattr(blocks, '_decompress', lambda *args: calls.append(decompress(*args)))
+    bag = Bag(path, topics)
+    assert (bag.count, bag.start, bag.end, bag.warnings) == (20, ARRIVALS[0], ARRIVALS[19], [])
+    assert bag.topics == {'/chatter', '/points'} and len(calls) == unpacked
+    assert [len(bag.stamps[topic].arrival) for topic in topics] == [
+        1 if topic == '/points' else 19 for topic in topics]
+
+
+def test_a_file_that_becomes_huge_is_not_unpacked(tmp_path):
+    path = tmp_path / 'bag.mcap.zstd'
+    path.write_bytes(zstandard.compress(bytes(100 << 20)))
+    with pytest.raises(BagError, match='unpacked it is more than 1000 times as large'):
+        Bag(path, ())
+
+
+def test_views_are_not_read(tmp_path):
+    """Such a view has no end."""
+    path = tmp_path / 'a.db3'
+    with closing(sqlite3.connect(path)) as storage:
+        storage.execute('CREATE TABLE topics(id, name, type, serialization_format)')
+        storage.execute('CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL '
+                        'SELECT id + 1 FROM n) SELECT id, 1 topic_id, id timestamp, 0 data FROM n')
+    with pytest.raises(BagError, match='it has views'):
+        Bag(path, ())

@@ -252,11 +252,16 @@ def hostile():
     def one(content, **changes):
         packed = zstandard.compress(content)
         return chunk(packed, size=len(content), crc=zlib.crc32(content), **changes)
+    empty, hollow = struct.pack('<BQ', 0x90, 0), message(b'')
+    full = bytes(64 << 20)
+
+    def full_of(record):
+        return one(good + record * (len(full) // len(record)))
     preamble = 'int64 timestamp\nint32 vpid\nint32 vtid\n'
 
     def of_schema(text):
         return one(definitions(preamble + text) + message(b'\xff' * 4))
-    return {
+    return {     # each is read in less than 5 s
         'record of 2**63 bytes': struct.pack('<BQ', 6, 2**63) + bytes(100),
         'record of 2**64-1 bytes': struct.pack('<BQ', 6, 2**64 - 1) + bytes(100),
         'message of 2**62 bytes': struct.pack('<BQ', 5, 2**62) + bytes(100),
@@ -295,7 +300,11 @@ def hostile():
         'a line of 10**6': one(definitions('int8 ' + 'a ' * 500_000) + message(bytes(8))),
         'a chunk in a chunk': one(chunk(bomb)),
         'a tail of zeros': one(good) + bytes(100_000),
-        'a row of empty records': one(good) + struct.pack('<BQ', 0x90, 0) * 10_000,
+        'a row of empty records': one(good) + empty * 10_000,
+        'zeros': chunk(zstandard.compress(full), size=len(full)),
+        'zeros in lz4': chunk(lz4.frame.compress(full), size=len(full), compression='lz4'),
+        'a chunk of empty records': full_of(empty),
+        'a chunk of undefined messages': full_of(hollow.replace(b'\1\0', b'\2\0', 1)),
     }
 
 
@@ -343,3 +352,89 @@ def test_hostile_lengths(tmp_path, finished):
         assert text.startswith(str(path)), (path, text)
         assert len(text) < 600
     assert texts[::2] == texts[1::2]
+
+
+def test_a_damaged_definition_loses_only_what_follows(tmp_path):
+    """Outside of chunks too, and in a chunk whose CRC is right."""
+    path = tmp_path / 'a.mcap'
+    sound = definitions() + message(bytes(8)) * 3
+    data = sound + channel('/other') + message(bytes(8))
+    head = records.MAGIC + records.record(Opcode.HEADER, prefixed(b'ros2') * 2)
+    for checked in (False, True):
+        for content in (data, chunk(zstandard.compress(data), size=len(data), crc=zlib.crc32(
+                data) if checked else 0)):
+            path.write_bytes(head + content)
+            events, (warning,) = read(path)
+            is_used = content is data or checked
+            assert len(events) == 3 * is_used
+            assert f'changes its meaning (at byte {len(head)}' in warning or content is data
+            assert f'with {3 * is_used} messages before it' in warning
+    path.write_bytes(head + data)
+    assert f'(at byte {len(head) + len(sound)})' in read(path)[1][0]
+
+
+def test_records_may_be_longer_than_what_is_known_of_them(tmp_path, sample):
+    """As later versions of MCAP may write them."""
+    data, chunks = sample
+    path, padded = tmp_path / 'a.mcap', data[:8]
+    for opcode, start, end in records_of(data):
+        if opcode == Opcode.DATA_END:
+            break
+        more = b'' if opcode == Opcode.MESSAGE else b'more'
+        padded += records.record(opcode, data[start + 9:end] + more)
+    padded += records.record(Opcode.DATA_END, bytes(7)) + records.record(
+        Opcode.FOOTER, bytes(20)) + records.MAGIC
+    path.write_bytes(padded)
+    assert read(path) == ([event for chunk in chunks for event in chunk], [])
+
+
+def test_two_files_in_one(tmp_path, sample):
+    data, chunks = sample
+    (tmp_path / 'a.mcap').write_bytes(data * 2)
+    events, (warning,) = read(tmp_path / 'a.mcap')
+    assert events == [event for chunk in chunks for event in chunk]
+    assert f'another one had been appended to it (at byte {len(data)}): used 4 chunks' in warning
+
+
+SPARSE = """
+import resource, sys
+from mddag_executor.trace import TraceReader
+resource.setrlimit(resource.RLIMIT_AS, (1400 << 20, 1400 << 20))
+reader = TraceReader(sys.argv[1])
+print(len(list(reader.events())), *reader.warnings)
+"""
+
+
+def test_a_damaged_footer_is_not_believed(tmp_path, sample):
+    """It says that the summary is nearly all of a large file."""
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(sample[0])
+    with open(path, 'r+b') as file:
+        file.truncate(8 << 30)
+        file.seek(0, os.SEEK_END)
+        file.write(records.record(Opcode.FOOTER, struct.pack('<QQI', 40, 0, 1)) + records.MAGIC)
+    text = run_program(SPARSE, path)[0]
+    assert text.startswith('14 ') and 'used 4 chunks' in text
+
+
+@pytest.mark.parametrize(('data', 'says'), [
+    (b'version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 9\n',
+     "is a pointer to a file in Git LFS, not the file itself: get the file with 'git lfs pull'"),
+    (b'#ROSBAG V2.0\n' + bytes(99),
+     "is a bag of ROS 1: convert it, as with 'rosbags-convert'"),
+])
+@pytest.mark.parametrize('name', ['a.mcap', 'a.db3', 'a.bag'])
+def test_other_files_are_named(tmp_path, monkeypatch, call, name, data, says):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_bytes(data)
+    done = call('replay', name)
+    assert (done.returncode, done.stderr) == (2, f'error: {name}: {says}\n')
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / name).rename(tmp_path / 'bag' / name)
+    (tmp_path / 'bag/metadata.yaml').write_text(
+        f'rosbag2_bagfile_information: {{relative_file_paths: [{name}]}}')
+    (tmp_path / 'g.yaml').write_text(
+        'mddag: 1\nnodes: [{node: /n, callbacks: [{name: c, subscription: /t, deadline: 1ms, '
+        'period: 9ms, execution_time: 1ms}]}]\n')
+    done = call('replay', 'bag', 'g.yaml', '--reschedule')
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1) and says in done.stderr
