@@ -58,6 +58,32 @@ def message_taker(subscription: Any) -> Callable[[], tuple[Any, dict[str, Any]] 
     return partial(subscription.handle.take_message, subscription.msg_type, subscription.raw)
 
 
+def publisher_ids(node: Any, subscription: Any) -> frozenset[bytes] | None:
+    """
+    Return the ids of the publishers of a subscription's topic.
+
+    None: they are unknown, or a content filter holds messages back (from 7.1.8 on).
+    """
+    try:
+        if getattr(subscription, 'is_cft_enabled', False):
+            return None
+        with node.handle, subscription.handle:
+            found = _rclpy.rclpy_get_publishers_info_by_topic(
+                node.handle, subscription.topic_name, False)
+    except RCL_ERRORS:
+        return None
+    return frozenset(bytes(each['endpoint_gid']) for each in found)
+
+
+def publisher_count(subscription: Any) -> int:
+    """Return the number of publishers that a subscription is matched with, -1 if unknown."""
+    try:
+        count: int = subscription.get_publisher_count()
+    except RCL_ERRORS:
+        return -1
+    return count
+
+
 def request_taker(service: Any) -> Callable[[], tuple[Any, Any] | None]:
     """Return a function that takes a request with its header, or returns None."""
     return _taker(service.handle.service_take_request, service.srv_type.Request)

@@ -211,7 +211,8 @@ class PoolWatch:
         self._last, self._at = counts, (now, cpu)
         workers = self._engine.n_workers
         lost = [f'{step[key]} {what}' for key, what in (
-            ('dropped', 'dropped'), ('skipped', 'timer releases skipped'),
+            ('dropped', 'dropped'), ('lost', 'messages lost by the middleware'),
+            ('skipped', 'timer releases skipped'),
             ('unattributed', 'messages without a job'), ('trace_lost', 'trace events lost'),
             ('unreported_misses', 'misses not reported to on_deadline_miss'),
         ) if step[key]]
@@ -227,7 +228,7 @@ class PoolWatch:
             'cpu_ratio': f'{cpu_used / passed:.3f}',
             'cpu_us_per_callback': f'{cpu_used / 1e3 / step["ran"]:.1f}' if step['ran'] else '',
             **{key: str(counts[key]) for key in (
-                'ran', 'dropped', 'skipped', 'unattributed', 'doubtful', 'trace_lost',
+                'ran', 'dropped', 'lost', 'skipped', 'unattributed', 'doubtful', 'trace_lost',
                 'unreported_misses')}}
         return Status(
             f'{self._thresholds.name}: {WORKERS}',

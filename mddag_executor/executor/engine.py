@@ -136,6 +136,14 @@ class Engine:
             'rmw_take', now, get_native_id(), id(entity.rclpy), id(message), source_timestamp,
             True)
 
+    def never_taken(self, entity: Entity, count: int, now: int) -> None:
+        """Note that the middleware dropped messages (see ``gaps``), as the next one shows."""
+        if entity.is_own:
+            return
+        entity.lost += count
+        if self.record is not None:
+            self.record('messages_lost', now, get_native_id(), entity.address, count)
+
     def timer_due(self, work: Work, due: int, now: int) -> None:
         """Handle a timer that became due at ``due``."""
         entity = work.entity

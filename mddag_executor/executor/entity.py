@@ -21,7 +21,7 @@ TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
 UNKNOWN_NS = 100_000_000
 """The expected duration of a callback that has not run yet, ns."""
 
-COUNTS = ('ready', 'ran', 'failed', 'dropped', 'skipped', 'unattributed', 'busy_ns')
+COUNTS = ('ready', 'ran', 'failed', 'dropped', 'lost', 'skipped', 'unattributed', 'busy_ns')
 _HAVE_HANDLES = (TIMER, SUBSCRIPTION, SERVICE)
 
 
@@ -37,8 +37,8 @@ class Entity:
 
     __slots__ = (
         'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
-        'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'skipped',
-        'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
+        'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'lost',
+        'skipped', 'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
         'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
         'publishes', 'at_once',
         'habit', 'since', 'gate', 'most_waiting', 'collect_more', 'classify', 'is_nested',
@@ -74,6 +74,8 @@ class Entity:
         # how many times its callback raised an exception
         self.failed = 0
         self.dropped = 0
+        # messages of a subscription that the middleware dropped (see ``gaps``)
+        self.lost = 0
         self.skipped = 0
         self.busy_ns = 0
         self.unattributed = 0

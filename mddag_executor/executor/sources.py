@@ -23,6 +23,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.gaps import Gaps
 from mddag_executor.executor.jobs import Publication, stamped_release
 from mddag_executor.executor.listeners import clear_listener, MANY, set_listener
 from mddag_executor.executor.loop import ChannelSource, EventLoop
@@ -114,11 +115,20 @@ class Source(EntitySource):
 
 
 class SubscriptionSource(Source):
-    """A subscription."""
+    """
+    A subscription.
 
-    def __init__(self, entity: Entity, pool: WorkerPool) -> None:
+    :param publishers: returns the ids of the publishers of a subscription (see ``gaps``).
+    """
+
+    def __init__(
+        self, entity: Entity, pool: WorkerPool,
+        publishers: Callable[[Any], frozenset[bytes] | None],
+    ) -> None:
         super().__init__(entity, pool.loop, compat.message_taker(entity.rclpy), pool.fail)
         self._pool = pool
+        self._gaps = Gaps(
+            partial(publishers, entity.rclpy), partial(compat.publisher_count, entity.rclpy))
         self._with_info = compat.callback_type(entity.rclpy) is compat.WITH_INFO
         self._is_plain = (
             pool.engine.record is None and entity.callback is None and not entity.is_own)
@@ -129,7 +139,12 @@ class SubscriptionSource(Source):
 
         :param publication: the one that has just sent it, if certain.
         """
-        entity, pool = self.entity, self._pool
+        entity, pool, gaps = self.entity, self._pool, self._gaps
+        number = taken[1].get('publication_sequence_number')
+        if number == gaps.expected:
+            gaps.expected += 1
+        elif missing := gaps.missing(number):
+            pool.engine.never_taken(entity, missing, pool.now)
         work = Work(entity, entity.rclpy.callback, taken if self._with_info else (taken[0],))
         if self._is_plain:
             pool.engine.ready(work, pool.now)

@@ -15,13 +15,16 @@ from functools import partial
 import threading
 import time
 from typing import Any
+import weakref
 
 from mddag_executor.executor import publishing
 from mddag_executor.executor.at_once import AtOnce, ClientSource, ClockSource
 from mddag_executor.executor.compat import (
+    alive,
     ends_sleep,
     is_builtin,
     is_of_wait_for_message,
+    publisher_ids,
 )
 from mddag_executor.executor.entity import (
     CLIENT,
@@ -63,6 +66,7 @@ class Upkeep:
         self.changed = True
         self._has_waitables = False
         self._nodes = nodes
+        self._living: list[weakref.ref[Any]] = []
         self._registry = registry
         self._pool = pool
         self._at_once = at_once
@@ -119,6 +123,7 @@ class Upkeep:
     def _refresh(self) -> None:
         pool, registry, engine = self._pool, self._registry, self._pool.engine
         nodes = self._nodes()
+        self._living = [weakref.ref(node) for node in nodes]
         found = snapshot(nodes)
         with pool.lock:
             now = pool.tick()
@@ -144,6 +149,11 @@ class Upkeep:
             pool.due.arm(time.monotonic_ns())
         self._refresh_waitables([*added, *back], gone)
 
+    def _publishers(self, subscription: Any) -> frozenset[bytes] | None:
+        """Return the ids of the publishers of a subscription, None if they are unknown."""
+        nodes = (node for each in self._living if (node := each()) is not None and alive(node))
+        return next((publisher_ids(node, subscription) for node in nodes), None)
+
     # --- sources ---------------------------------------------------------------------------------
 
     def _listen(self, entity: Entity) -> None:
@@ -160,7 +170,7 @@ class Upkeep:
             if is_of_wait_for_message(entity.rclpy):
                 return
             source = (ClockSource(entity, at_once) if entity.at_once
-                      else SubscriptionSource(entity, pool))
+                      else SubscriptionSource(entity, pool, self._publishers))
         elif entity.kind == SERVICE:
             share = f'services {entity.node}' if is_builtin(entity.rclpy) else ''
             source = ServiceSource(entity, pool)

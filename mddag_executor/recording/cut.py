@@ -80,11 +80,13 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
     takes['execution'] = executions.new(takes['execution'])
     takes['message'] = messages.new(takes['message'])
     stops, drops, demotions = recording.stops, recording.drops, recording.demotions
+    losses = recording.losses
     return replace(
         recording, releases=pick(released, seen[jobs.of(released)]), executions=table,
         publications=sent, takes=takes, job_ends=pick(ends, seen[jobs.of(ends)]),
         stops=pick(stops, (stops['start'] < last) & (stops['end'] > begin)),
         drops=pick(drops, (drops['time'] >= begin) & (drops['time'] < last)),
+        losses=pick(losses, (losses['time'] >= begin) & (losses['time'] < last)),
         demotions=pick(demotions, (demotions['time'] >= begin) & (demotions['time'] < last)),
         misses=pick(recording.misses, judged[jobs.of(recording.misses)]),
         start=begin, end=until, judged_releases=(begin, end))

@@ -44,6 +44,7 @@ from mddag_executor.recording.tables import (
     Growing,
     Ints,
     JOB_ENDS,
+    LOSSES,
     Mask,
     MISSES,
     OUTDATED,
@@ -67,10 +68,10 @@ import numpy as np
 
 _PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
 (_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
- _JUDGE_FROM) = (
+ _JUDGE_FROM, _MESSAGES_LOST) = (
     f'mddag:{name}' for name in (
         'deadline', 'demote', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop',
-        'hosted', 'shutdown', 'judge_from'))
+        'hosted', 'shutdown', 'judge_from', 'messages_lost'))
 _FIELDS = {
     DISPATCH: 'vtid callback dag vertex job worker ready',
     END: 'vtid callback',
@@ -78,7 +79,8 @@ _FIELDS = {
     _PUBLISH: 'vtid publisher_handle', _RELEASE: 'dag job release',
     _DEADLINE: 'dag vertex job deadline completed', _DEMOTE: 'dag vertex job',
     _FAIL: 'dag vertex job', _EXPIRE: 'dag job', _ABORT: 'dag job', _OUTDATE: 'dag job',
-    _LOST: 'count', _STOP: 'begin end', _JUDGE_FROM: 'release', _SHUTDOWN: 'end'}
+    _LOST: 'count', _MESSAGES_LOST: 'callback count', _STOP: 'begin end',
+    _JUDGE_FROM: 'release', _SHUTDOWN: 'end'}
 """The used fields of events that have only numbers."""
 _ROWS = {name: np.dtype([(field, 'i8') for field in ('place', 'timestamp', *fields.split())])
         for name, fields in _FIELDS.items()}
@@ -216,6 +218,9 @@ class _Source:
         found.misses = self._at_vertices(
             _DEADLINE, MISSES, job='job', deadline='deadline', completed='completed')
         found.demotions = self._at_vertices(_DEMOTE, DEMOTIONS, job='job', time='timestamp')
+        losses = self._pop(_MESSAGES_LOST)
+        found.losses = rows(LOSSES, len(losses), callback=losses['callback'],
+                            time=losses['timestamp'], count=losses['count'])
         stops = self._pop(_STOP)
         found.notices_stops = earliest(stops['end'])
         stops = stops[stops['begin'] < stops['end']]    # the first one is empty: stops are noticed

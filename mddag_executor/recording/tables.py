@@ -72,6 +72,7 @@ TAKES = _table(execution='i8', message='i8', time='i8')
 JOB_ENDS = _table(
     process='i2', dag='i4', vertex='i4', job='i8', time='i8', reason='i1', order='i8')
 DROPS = _table(process='i2', vertex='i4', job='i8', time='i8', reason='i2')
+LOSSES = _table(process='i2', callback='i8', time='i8', count='i8')
 DEMOTIONS = _table(process='i2', dag='i4', vertex='i4', job='i8', time='i8')
 MISSES = _table(dag='i4', vertex='i4', job='i8', deadline='i8', completed='i8')
 STOPS = _table(process='i2', start='i8', end='i8')
@@ -79,7 +80,7 @@ STOPS = _table(process='i2', start='i8', end='i8')
 TABLES = {
     'releases': RELEASES, 'executions': EXECUTIONS, 'publications': PUBLICATIONS,
     'job_ends': JOB_ENDS, 'stops': STOPS, 'takes': TAKES, 'drops': DROPS,
-    'demotions': DEMOTIONS, 'misses': MISSES}
+    'losses': LOSSES, 'demotions': DEMOTIONS, 'misses': MISSES}
 """The tables of a recording with the types of their columns."""
 
 
@@ -191,6 +192,7 @@ class Recording:
     stops: Table = field(default_factory=lambda: rows(STOPS))
     takes: Table = field(default_factory=lambda: rows(TAKES))
     drops: Table = field(default_factory=lambda: rows(DROPS))
+    losses: Table = field(default_factory=lambda: rows(LOSSES))
     demotions: Table = field(default_factory=lambda: rows(DEMOTIONS))
     misses: Table = field(default_factory=lambda: rows(MISSES))
     start: int | None = None
@@ -234,6 +236,15 @@ class Recording:
         counts = np.bincount(self.drops['reason'], minlength=len(self.drop_reasons))
         return Counter({
             name: n for name, n in zip(self.drop_reasons, counts.tolist()) if n})
+
+    @property
+    def messages_lost(self) -> dict[str, int]:
+        """Return by callback the number of messages that the middleware lost."""
+        counts: Counter[str] = Counter()
+        for callback, count in zip(*(self.losses[each].tolist() for each in (
+                'callback', 'count'))):
+            counts[self.callback_name(callback)] += count
+        return dict(counts)
 
     @property
     def unjudged(self) -> dict[int, int] | None:

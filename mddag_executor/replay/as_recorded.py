@@ -110,6 +110,7 @@ class Replay:
             'undeclared': self.usage.undeclared(),
             'worker_use': self.usage.workers(head.workers, duration),
             'dropped': dict(sorted(recording.dropped.items())),
+            'messages_lost': recording.messages_lost,
             'misses': self.explanation.summary(),
             'paths': paths,
             **({} if not recording.imported else {

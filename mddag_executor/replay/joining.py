@@ -79,8 +79,8 @@ _INIT, _SHUTDOWN, _JUDGE_FROM = 'ros2_caret:caret_init', 'mddag:shutdown', 'mdda
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
 _TIMES = {
     'releases': ('release', 'noticed'), 'executions': ('ready', 'began', 'start', 'end'),
-    'publications': ('time', 'source_timestamp'), 'job_ends': ('time',), 'drops': ('time',),
-    'demotions': ('time',),
+    'publications': ('time', 'source_timestamp'), 'job_ends': ('time',),
+    'drops': ('time',), 'losses': ('time',), 'demotions': ('time',),
     'misses': ('deadline', 'completed'), 'stops': ('start', 'end')}
 _HAPPENED = {
     'releases': 'noticed', 'executions': 'end', 'publications': 'time', 'job_ends': 'time',
@@ -157,7 +157,9 @@ class _Part:
                     times[times > 0] += self.shift
             if found.notices_stops is not None:
                 found.notices_stops += self.shift
-        for addresses in (found.executions['callback'], found.publications['publisher']):
+        for addresses in (
+                found.executions['callback'], found.losses['callback'],
+                found.publications['publisher']):
             addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
         worker = found.executions['worker']
         # other threads, with higher numbers, lent themselves

@@ -34,6 +34,7 @@ from mddag_executor.recording.tables import (
     DROPS,
     find_pairs,
     Ints,
+    LOSSES,
     Mask,
     Recording,
     rows,
@@ -54,7 +55,7 @@ from mddag_executor.replay.links import Links
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
-_DROP = 'mddag:drop'
+_DROP, _MESSAGES_LOST = 'mddag:drop', 'mddag:messages_lost'
 _ROUNDING_NS = 1_000        # of the two clocks that stamp and publication are read from
 _UNSENT = 256               # publications of a topic without a timestamp that are compared
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
@@ -132,7 +133,7 @@ class UndeclaredRun(ImportedRun):
     """A run of this executor that was recorded without a declaration."""
 
     kinds = {**KINDS, **OWN_KINDS}
-    others = (*INIT_EVENTS, _DROP)
+    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST)
     links_type = _OwnLinks
 
     def read(self) -> Recording:
@@ -142,20 +143,25 @@ class UndeclaredRun(ImportedRun):
         found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
         if not found.shut_down:
             found.warnings.append(no_end(self.name))
-        drops, reasons = [], dict[str, int]()
+        drops, reasons, losses = [], dict[str, int](), []
         for event in self._events.others:
-            if event[0].name != _DROP or not {'callback', 'reason'} <= {*event[0].fields}:
+            if event[0].name not in (_DROP, _MESSAGES_LOST):
                 continue
             _, time, pid, _, *values = event
             fields = dict(zip(event[0].fields, values))
-            callback = self.who.callbacks.latest(pid, fields['callback'], time)
-            drops.append((
-                UNKNOWN if callback is None else self._vertex.get(callback.number, UNKNOWN),
-                time, reasons.setdefault(str(fields['reason']), len(reasons))))
+            callback = self.who.callbacks.latest(pid, fields.get('callback', 0), time)
+            number = UNKNOWN if callback is None else callback.number
+            if 'reason' in fields:
+                drops.append((self._vertex.get(number, UNKNOWN), time,
+                              reasons.setdefault(str(fields['reason']), len(reasons))))
+            elif isinstance(fields.get('count'), int):
+                losses.append((number, time, fields['count']))
         vertex, times, reason = zip(*drops) if drops else ((), (), ())
         found.drops = rows(
             DROPS, len(drops), vertex=vertex, job=UNKNOWN, time=times, reason=reason)
         found.drop_reasons = tuple(reasons)
+        callbacks, times, count = zip(*losses) if losses else ((), (), ())
+        found.losses = rows(LOSSES, len(losses), callback=callbacks, time=times, count=count)
         return found
 
     def _judged_until(self) -> int:

@@ -30,7 +30,7 @@ _DAG_COLUMNS = {
 _POOL_COLUMNS = {
     'workers of': 'name', 'state': 'level', 'busy': 'busy_ratio', 'CPU': 'cpu_ratio',
     'idle': 'idle_workers', 'queue': 'queue', 'dropped': 'dropped', 'per s': 'callbacks_per_s',
-    'us each': 'cpu_us_per_callback', 'compute': 'computing', 'skipped': 'skipped',
+    'us each': 'cpu_us_per_callback', 'compute': 'computing', 'lost': 'lost', 'skipped': 'skipped',
     'no job': 'unattributed'}
 _PROCESS, _MESSAGE = {'process': 'process'}, {'message': 'message'}
 _SHARES = ('deadline_used_max', 'busy_ratio', 'cpu_ratio')

@@ -41,6 +41,8 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
     callbacks = result['callbacks']
     for one, many, numbers in (
             ('dropped', 'dropped', result['dropped']),
+            ('message lost by the middleware', 'messages lost by the middleware',
+             _numbers(callbacks, 'lost')),
             ('run of callbacks that raised', 'runs of callbacks that raised',
              _numbers(callbacks, 'failed')),
             ('timer release skipped', 'timer releases skipped', _numbers(callbacks, 'skipped')),

@@ -16,7 +16,7 @@ from mddag_executor.report.tables import (
     with_means,
     worst_first,
 )
-from mddag_executor.report.text import Cell, format_ns, printable, table
+from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 from msg_graph.binding import is_background
 
@@ -145,6 +145,10 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     if dropped:
         yield f'{sum(dropped.values())} dropped: ' + ', '.join(
             f'{printable(reason)} {n}' for reason, n in dropped.items())
+    lost = result['messages_lost']
+    if lost:
+        yield (f'{counted(sum(lost.values()), "message")} lost by the middleware: '
+               + listed([f'{name} {n}' for name, n in lost.items()]))
 
 
 def _use(result: Mapping[str, Any]) -> str:

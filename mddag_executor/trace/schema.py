@@ -150,6 +150,8 @@ _ALL = (
     _event('mddag', 'deadline',
            dag=_I32, vertex=_I32, job=_I64, deadline=_I64, completed=_I64),
     _event('mddag', 'drop', callback=_U64, dag=_I32, vertex=_I32, job=_I64, reason=_STR),
+    # messages of a subscription that the middleware dropped before the one that is taken now
+    _event('mddag', 'messages_lost', callback=_U64, count=_I64),
     _event('mddag', 'demote', dag=_I32, vertex=_I32, job=_I64),
     _event('mddag', 'fail', dag=_I32, vertex=_I32, job=_I64),
     _event('mddag', 'expire', dag=_I32, job=_I64),
