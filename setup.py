@@ -17,7 +17,6 @@ DOCS = [
     'pymdown-extensions<12; python_version<"3.11"',
 ]
 EXPORT = ['pyarrow>=14']
-REPORT = ['bokeh>=3.6']
 TEST_LIVE = [
     *BATCH, 'hypothesis', 'jsonschema', 'pytest>=7.4', 'pytest-timeout', 'pytest-xdist']
 
@@ -95,8 +94,6 @@ setup(
         'docs': DOCS,
         # files for data frames
         'export': EXPORT,
-        # --report OUT.html
-        'report': REPORT,
         'ros': ros('jazzy', *ROS),
         # instead of `ros`
         'ros-kilted': ros('kilted', *ROS),
@@ -104,7 +101,6 @@ setup(
             *DASK,
             *DOCS,
             *EXPORT,
-            *REPORT,
             *TEST_LIVE,
             'colcon-bash',
             'colcon-package-selection',

@@ -20,7 +20,7 @@ NAME = 'mddag_executor'
 SHARE = f'share/{NAME}'
 ROS = ('ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch', 'launch_ros',
        'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'rosidl_parser', 'std_msgs')
-OPTIONAL = ('bokeh', 'distributed', 'llvmlite', 'matplotlib', 'numba', 'perfetto', 'pyarrow')
+OPTIONAL = ('distributed', 'llvmlite', 'matplotlib', 'numba', 'perfetto', 'pyarrow')
 BLOCKER = """
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.machinery import PathFinder
@@ -62,15 +62,13 @@ def test_works_without_anything_optional(tmp_path):
         'graph draw graph.yaml -o out.mmd',
         'simulate graph.yaml --duration 100ms --trace out.mcap',
         'evaluate graph.yaml --runs 2 --duration 50ms --policies rad',
-        f'replay {TRACE}', f'export {TRACE} -o out.csv', f'diff {TRACE} {TRACE}']
+        f'replay {TRACE} --report out.html', f'export {TRACE} -o out.csv', f'diff {TRACE} {TRACE}']
     done = run_without((*OPTIONAL, *ROS), commands, tmp_path)
     assert [(command, errors) for command, (status, errors) in zip(commands, done, strict=True)
             if status > 1 or errors] == []
 
 
 @pytest.mark.parametrize(('missing', 'extra', 'commands'), [
-    ('bokeh', 'report', ['simulate graph.yaml --report out.html',
-                         f'replay {TRACE} --report out.html']),
     ('pyarrow', 'export', [f'export {TRACE} -o out.parquet']),
     ('matplotlib', 'batch', ['evaluate graph.yaml --runs 2 --plot out.png']),
     ('distributed', 'dask', ['evaluate graph.yaml --runs 2 --dask tcp://127.0.0.1:9']),
@@ -80,10 +78,10 @@ def test_says_in_one_line_what_is_missing(tmp_path, missing, extra, commands):
     for status, errors in run_without((missing,), commands, tmp_path):
         assert (status, errors.count('\n')) == (2, 1) and errors.startswith('error: '), errors
         assert f'mddag_executor[{extra}]' in errors
-        assert {'distributed': 'Dask', 'bokeh': 'Bokeh'}.get(missing, missing) in errors
+        assert {'distributed': 'Dask'}.get(missing, missing) in errors
     assert [path.name for path in tmp_path.iterdir()] == ['graph.yaml']
 
-HEAVY = {'bokeh', 'ctypes', 'distributed', 'llvmlite', 'lz4', 'matplotlib', 'mcap', 'numba',
+HEAVY = {'ctypes', 'distributed', 'llvmlite', 'lz4', 'matplotlib', 'mcap', 'numba',
          'numpy', 'perfetto', 'pyarrow', 'rclpy', 'rosbags', 'ruamel', 'yaml', 'zstandard'}
 
 

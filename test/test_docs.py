@@ -37,7 +37,6 @@ FILES = {
 # What its commands need besides what every installation has.
 EXTRAS = {
     'README.md': ('rclpy',),
-    'docs/judge.md': ('bokeh',),
     'docs/laboratory.md': ('matplotlib', 'distributed'),
     'docs/figures.md': ('matplotlib',),
     'docs/run.md': ('rclpy',),

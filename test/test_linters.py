@@ -33,7 +33,7 @@ THIRD_PARTY = {
         'geometry_msgs', 'launch', 'launch_ros', 'nav_msgs', 'rcl_interfaces', 'rclpy', 'ros2cli',
         'rosgraph_msgs', 'rosidl_parser', 'sensor_msgs', 'std_msgs')},
     **{name: (None, name) for name in (
-        'bokeh', 'distributed', 'matplotlib', 'numba', 'pandas', 'pyarrow')},
+        'distributed', 'matplotlib', 'numba', 'pandas', 'pyarrow')},
     **{name: ('mcap-ros2-support', name) for name in ('lz4', 'mcap', 'zstandard')},
     'argcomplete': ('python3-argcomplete', 'argcomplete'), 'dask': (None, 'distributed'),
     'llvmlite': (None, 'numba'), 'numpy': ('python3-numpy', 'numpy'),

@@ -181,8 +181,6 @@ def _check_report(path: Report) -> None:
     # `replay run.mcap --report graph.yaml` must not replace a declaration.
     if os.path.splitext(path)[1].lower() not in ('', '.html', '.htm'):
         raise UsageError(f'--report {path}: a report is an HTML file: let its name end in .html')
-    from mddag_executor.report.html import check_available
-    check_available()
 
 
 @contextmanager

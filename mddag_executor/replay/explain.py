@@ -396,6 +396,18 @@ class Explanation:
         return {(sink, job): CAUSES[cause] for sink, job, cause in zip(
             missed['sink'].tolist(), missed['job'].tolist(), self.found.causes.tolist())}
 
+    def longest_behind(self) -> dict[tuple[int, int], str]:
+        """Return by sink and job the callback that the miss waited for longest, if it waited."""
+        waits: defaultdict[int, Counter[int]] = defaultdict(Counter)
+        of = self.found.parts['miss']
+        for part, callbacks in self._waited.items():
+            for callback, took in callbacks:
+                waits[int(of[part])][callback] += took
+        missed = self.found.misses
+        return {(int(missed['sink'][miss]), int(missed['job'][miss])):
+                self._names[max(took, key=lambda callback: (took[callback], -callback))]
+                for miss, took in waits.items()}
+
     def worst(self) -> dict[str, Any] | None:
         """Return the latest job; if none completed, the first miss."""
         every = self.found.misses

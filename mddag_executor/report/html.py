@@ -15,19 +15,14 @@ from typing import Any, BinaryIO
 
 from mddag_executor import __version__
 from mddag_executor.core.tally import total
-from mddag_executor.errors import MddagError
+from mddag_executor.recording.tables import Ints
 from mddag_executor.replay import Replay, Reschedule
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.report.explained import causes_line
-from mddag_executor.report.html_data import (
-    COLOURS,
-    json_for_html,
-    prepare,
-    Prepared,
-    ReportData,
-)
+from mddag_executor.report.html_data import json_for_html, page_data, ReportData, shown_misses
 from mddag_executor.report.html_tables import (
     callbacks_html,
+    data_table,
     html_table,
     misses_html,
     page_head,
@@ -35,7 +30,7 @@ from mddag_executor.report.html_tables import (
     worst_html,
     worst_line,
 )
-from mddag_executor.report.replays import PATHS_HEADER, paths_rows
+from mddag_executor.report.replays import communications_table, PATHS_HEADER, paths_rows
 from mddag_executor.report.tables import never_due_lines, pool_text, ratio, verdicts_line
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import Timeline
@@ -44,19 +39,12 @@ from mddag_executor.text import counted
 from msg_graph import TaskSet
 
 _SCRIPT = Path(__file__).with_name('html.js')
-_LEGEND = (
-    'deadline missed', 'slack below 10 % of the deadline', 'below 25 %', 'below 50 %',
-    '50 % and more', 'no deadline, or no verdict')
-_BARS = 'Each bar is one execution, in the colour of the least slack that it leads to.'
-
-
-def check_available() -> None:
-    """Check that reports can be made, before long work starts."""
-    try:
-        import bokeh  # noqa: F401
-    except ImportError:
-        raise MddagError(
-            "--report: Bokeh is not installed: pip install 'mddag_executor[report]'") from None
+_LEGEND = {
+    'missed': 'deadline missed', 'least': 'slack below 10 % of the deadline',
+    'less': 'below 25 %', 'more': 'below 50 %', 'most': '50 % and more',
+    'unknown': 'no deadline, or no verdict'}
+_KEYS = (('n, p', 'next and previous miss'), ('Left, Right', 'move'), ('+, -', 'zoom'),
+         ('0', 'the whole run'))
 
 
 def of_outcome(outcome: Replay | Reschedule) -> ReportData:
@@ -67,6 +55,7 @@ def of_outcome(outcome: Replay | Reschedule) -> ReportData:
         return _data(
             'Replay as recorded', [('recording', trace)], result, outcome, outcome.duration_ns,
         )._replace(causes=outcome.explanation.causes(),
+                   behind=outcome.explanation.longest_behind(),
                    worker_names=outcome.recording.worker_names)
     what, title = ('bag', 'Bag') if outcome.recorded is None else ('recording', 'Replay')
     data = _data(f'{title}, rescheduled', [(what, trace)], result,
@@ -86,74 +75,94 @@ def _data(
     title: str, facts: list[tuple[str, str]], result: Mapping[str, Any], replay: Replay,
     duration_ns: int,
 ) -> ReportData:
-    facts = [*facts, ('pool', pool_text(result)), ('duration', format_ns(result['duration_ns'])),
-             ('utilisation', ratio(result['utilisation']))]
+    facts = [*facts, ('pool', pool_text(result)), ('duration', format_ns(result['duration_ns']))]
+    every = result.get('worker_use', {}).get('use')
+    if result['dags']:
+        facts.append(('utilisation', ratio(result['utilisation'])))
+    if every is not None:
+        facts.append(('utilisation by all callbacks', ratio(every)))
     return ReportData(title, facts, result, replay, Timeline(replay.recording, replay.judged),
                       duration_ns)
 
 
 def write(file: BinaryIO, data: ReportData) -> None:
     """Write a report."""
-    from bokeh.embed import components
-    from bokeh.resources import Resources
-    from mddag_executor.report.html_plots import figures, THEME
-    prepared = prepare(data)
-    script, divisions = components(figures(data, prepared), theme=THEME)
-    library = Resources(mode='inline', components=['bokeh']).render_js()
-    for part in _page(data, prepared, library, script, list(divisions)):
+    misses = shown_misses(data.timeline.verdicts)
+    for part in _page(data, misses):
         file.write(part.encode('utf-8', 'backslashreplace'))
 
 
-def _page(
-    data: ReportData, prepared: Prepared, library: str, script: str, divisions: list[str]
-) -> Iterator[str]:
-    overview, workers, callbacks, *histograms = (
-        f'<div class="mddag-plot">{division}</div>' for division in divisions)
+def _page(data: ReportData, misses: Ints) -> Iterator[str]:
     task_set = data.replay.task_set
     title = escape(printable(
         f'{data.title}: {PurePath(task_set.file or data.facts[0][1]).name}'))
-    yield page_head(title)
-    yield library
-    yield f'</head><body>\n<h1>{title}</h1>\n'
+    yield f'{page_head(title)}</head><body>\n<h1>{title}</h1>\n'
     yield from _head(data)
+    yield '<noscript><p class="warning">The pictures need JavaScript.</p></noscript>\n'
     if task_set.dags:
-        yield misses_html(data, prepared)
-        yield f'<h2>Sinks</h2>\n{sinks_html(data)}\n'
+        yield misses_html(data, data.timeline.verdicts[misses])
+        yield f'<h2>Sinks</h2>\n{sinks_html(data)}'
     else:
         yield _note('No DAG is declared: give a GRAPH to judge deadlines.')
-    legend = ''.join(f'<span><i style="background:{colour}"></i>{text}</span>'
-                     for colour, text in zip(COLOURS, _LEGEND))
-    yield (f'<h2 id="mddag-timeline">Timeline</h2>\n<p class="legend">{legend}'
-           '<span><b class="miss">&#9660;</b>a missed deadline that the table lists</span></p>\n')
-    yield _note('Times count from the beginning of the run. Drag the window of the first picture, '
-                'or its edges. In the others drag to move, zoom with Ctrl and the wheel (or the '
-                'tools above a picture), and point at a bar for its facts.')
-    yield ('<p class="buttons"><button id="mddag-previous">&#9664; previous miss</button> '
-           '<button id="mddag-next">next miss &#9654;</button> '
-           '<button id="mddag-whole">whole run</button> <span id="mddag-status"></span></p>\n')
-    yield f'{overview}\n{_note(_BARS)}'
-    yield f'<h3>By worker</h3>\n{workers}\n<h3>By callback</h3>\n'
-    if prepared.n_hidden:
-        yield _note('DAGs that missed the largest share of their deadlines come first. Left '
-                    f'out: {counted(prepared.n_hidden, "callback")}.')
-    yield f'{callbacks}\n'
+    yield from _timeline(data, bool(len(misses)))
     if data.result.get('paths'):
         yield '<h2>End to end</h2>\n' + _note(
             'From the first publication to the start of the last callback.')
-        paths = html_table(PATHS_HEADER, paths_rows(data.result['paths']), 3)
-        yield f'<div class="wide">{paths}</div>\n'
-    if histograms:
+        yield data_table(html_table(PATHS_HEADER, paths_rows(data.result['paths']), 3),
+                         name='paths')
+    if any(sink.responses for sink in data.replay.tally.sinks.values()):
         yield '<h2>Response times against deadlines</h2>\n' + _note(
-            'Nearest to its deadline, or furthest past it, first. What never completed is in the '
-            'table of sinks only.')
-        yield f'<div class="grid">{"".join(histograms)}</div>\n'
-        yield f'<h2>Where the time of the worst jobs went</h2>\n{worst_html(data)}\n'
-    yield f'<h2>Callbacks</h2>\n{callbacks_html(data)}\n'
+            'The sink nearest to its deadline, or furthest past it, comes first. Jobs that never '
+            'completed are in the table of sinks only.')
+        yield '<div class="grid" id="mddag-histograms"></div>\n'
+        yield f'<h2>Where the time of the worst jobs went</h2>\n{worst_html(data)}'
+    yield f'<h2>Callbacks</h2>\n{callbacks_html(data)}'
+    if not task_set.dags and data.result.get('communications'):
+        yield '<h2>Messages</h2>\n' + _note(
+            'Times are from the publication to the start of the callback.')
+        yield data_table(html_table(*communications_table(data.result['communications']), 3),
+                         'search messages', name='messages')
     yield f'<footer>mddag_executor {escape(__version__)}</footer>\n'
-    yield ('<script id="mddag-meta" type="application/json">'
-           f'{json_for_html(prepared.meta)}'
-           f'</script>\n{script}\n<script>{_SCRIPT.read_text(encoding="utf-8")}</script>\n')
-    yield '</body></html>\n'
+    yield ('<script id="mddag-data" type="application/json">'
+           f'{json_for_html(page_data(data, misses))}</script>\n'
+           f'<script>{_SCRIPT.read_text(encoding="utf-8")}</script>\n</body></html>\n')
+
+
+def _timeline(data: ReportData, missed: bool) -> Iterator[str]:
+    """Yield the part of the page that has the timelines; the script draws them."""
+    judged = bool(data.replay.task_set.dags)
+    legend = ''.join(
+        f'<span><i class="{kind}"></i>{text}</span>' for kind, text in _LEGEND.items()
+        if (judged or kind == 'unknown') and (missed or kind != 'missed'))
+    if data.timeline.gaps:
+        legend += '<span><i class="gap"></i>executions left out</span>'
+    if missed:
+        legend += ('<span><b class="miss">&#9660;</b>missed deadline</span>'
+                   '<span><i class="job"></i>chosen job, until its deadline</span>'
+                   '<span><i class="late"></i>its lateness</span>')
+    keys = ''.join(f'<span><kbd>{key}</kbd> {text}</span>' for key, text in _KEYS
+                   if missed or 'miss' not in text)
+    yield ('<section id="mddag-timeline"><h2>Timeline</h2>\n'
+           f'<p class="legend">{legend}</p>\n')
+    yield _note('Times count from the beginning of the run. Each bar is one execution'
+                + (', in the colour of the least slack that it leads to' if judged else '')
+                + '; point at it for its facts. Drag the window of the first picture, or its '
+                'edges; drag the others to move, and zoom with Ctrl and the wheel.')
+    button = '<button type="button" id="mddag-{}">{}</button> '.format
+    yield '<div class="buttons">'
+    if missed:
+        yield (button('previous', '&#9664; previous miss') + button('next', 'next miss &#9654;'))
+    yield (button('out', '&minus;') + button('in', '+') + button('whole', 'whole run')
+           + f'<span class="keys">{keys}</span>'
+           '<div id="mddag-status" role="status"></div></div>\n')
+    yield ('<canvas id="mddag-overview" tabindex="0" role="img" aria-label="busy workers over the '
+           'whole run"></canvas>\n<h3>By worker</h3>\n<canvas id="mddag-workers" tabindex="0" '
+           'role="img" aria-label="executions by worker"></canvas>\n<h3>By callback</h3>\n'
+           '<p class="search"><input type="search" id="mddag-lines" placeholder="DAG or callback" '
+           'aria-label="show the DAGs or callbacks of this name"> <span class="note" '
+           'id="mddag-shown"></span></p>\n<canvas id="mddag-callbacks" tabindex="0" role="img" '
+           'aria-label="executions by callback"></canvas>\n<div id="mddag-tip" hidden></div>'
+           '</section>\n')
 
 
 def _note(text: str, kind: str = 'note') -> str:

@@ -1,24 +1,25 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The data of an HTML report, from which its script draws the timeline and makes texts.
+The data of an HTML report, from which its script draws the timelines and histograms.
 
 The page has the executions and verdicts that ``timeline`` selects, as columns of numbers that
 refer to lists of names; the script makes the texts of tool tips. So a page stays small. Times are
-seconds since the start of the recording. A name is only ever JSON here, text in HTML or text on a
-canvas, never markup or code.
+nanoseconds since the start of the recording. A name is only ever JSON here, text in HTML or text
+on a canvas, never markup or code.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import json
 from typing import Any, NamedTuple
 
 from mddag_executor.core.state import SINK_IN_TIME
-from mddag_executor.core.tally import counts, VERDICTS
-from mddag_executor.recording.tables import Ints, look_up, Table
+from mddag_executor.core.tally import counts, SinkTally, VERDICTS
+from mddag_executor.recording.tables import Ints, look_up, rows_by, Table
 from mddag_executor.replay import Replay
+from mddag_executor.replay.usage import PoolUse
 from mddag_executor.report.export import executions
 from mddag_executor.report.tables import missed_share, short_names
 from mddag_executor.report.text import format_ns, printable, shortened
@@ -27,15 +28,13 @@ from msg_graph import Dag
 import numpy as np
 
 MOST_MISSES = 500
-MOST_LINES = 150
-"""Maximum number of lines of the timeline by callback."""
-LONGEST_LABEL = 40
-RED, ORANGE, BLUE, UNKNOWN = '#d7191c', '#fd8d3c', '#3182bd', '#969696'
-COLOURS = (RED, ORANGE, '#fec44f', '#9ecae1', BLUE, UNKNOWN)
-"""The colours of executions, from the least slack to the most, and without a verdict."""
-_SHARES = (0.0, 0.1, 0.25, 0.5)
-"""Thresholds between the colours: slack as a share of the deadline."""
-_HIDDEN = -10       # position of a callback without line
+MOST_HISTOGRAMS = 30
+LONGEST_LABEL = 44
+COLOURS = ('missed', 'least', 'less', 'more', 'most', 'unknown')
+"""Classes of executions: missed, least slack to most slack, and without a verdict."""
+SHARES = (0.0, 0.1, 0.25, 0.5)
+"""Thresholds between the classes: slack as a share of the deadline."""
+_BARS, _MOST_BARS = 60, 400     # of a histogram
 
 
 class ReportData(NamedTuple):
@@ -47,6 +46,7 @@ class ReportData(NamedTuple):
     :ivar replay: the run as it was recorded or computed.
     :ivar duration_ns: from the first release to the end of the run.
     :ivar causes: the cause of each miss, by global vertex of the sink and job.
+    :ivar behind: the callback that most delayed it, for misses that waited; also by sink and job.
     :ivar worker_names: the names of workers, if they are more than a number.
     """
 
@@ -57,104 +57,133 @@ class ReportData(NamedTuple):
     timeline: Timeline
     duration_ns: int
     causes: Mapping[tuple[int, int], str] = {}
+    behind: Mapping[tuple[int, int], str] = {}
     worker_names: Sequence[str] = ()
 
 
 class Line(NamedTuple):
-    """A line of a timeline: label, position from the bottom, whether it is a DAG's title."""
+    """A line of the timeline by callback: label, whether it is a DAG's title, and its DAG."""
 
     label: str
-    y: int
-    heading: bool = False
+    heading: bool
+    dag: str
 
 
-class Prepared(NamedTuple):
+def slack_class(share: float) -> str:
+    """Return the class of a slack, given as a share of the deadline."""
+    return COLOURS[int(np.searchsorted(SHARES, share, 'right'))]
+
+
+def shown_misses(verdicts: Table) -> Ints:
     """
-    A report's data, ready to be drawn.
+    Return the rows of the missed deadlines to list, in the order of their releases.
 
-    :ivar executions: the columns of the executions; ``marks``: of the worst misses.
-    :ivar lines: of the timelines by callback, and by worker; ``n_hidden`` is the number of
-        callbacks without line.
-    :ivar misses: the worst misses, in the order of their releases.
-    :ivar meta: for the page's script.
+    The worst miss of each sink comes before the second worst of any. Misses of one rank are
+    compared by their lateness as a share of the deadline. A job that never completed is late by
+    at least its deadline.
     """
-
-    executions: dict[str, Any]
-    marks: dict[str, Any]
-    lines: list[Line]
-    worker_lines: list[Line]
-    n_hidden: int
-    misses: Table
-    meta: dict[str, Any]
-
-
-def prepare(data: ReportData) -> Prepared:
-    """Prepare a report's data for drawing."""
-    replay, verdicts = data.replay, data.timeline.verdicts
-    columns, rows = executions(replay, data.timeline.rows)
-    column, table = {each.name: each for each in columns}, replay.recording.executions[rows]
-    names = [printable(name) for name in column['vertex'].names]
-    lines, ys, n_hidden = _lines(data, names)
-
-    leads_to, colour = _verdicts_of(data, table)
-    worst = _worst_misses(verdicts)
-    misses = verdicts[worst]
-    marked_at = np.where(misses['completed'] < 0, misses['deadline'], misses['completed'])
-    workers, n = table['worker'].astype(np.int32), data.result['workers']
-    on = np.where((workers >= 0) & (workers < n), workers, n)
-    spare = int((on == n).any())
-    declared, known = (np.asarray(column[name].known) for name in ('dag', 'release_ns'))
-    return Prepared(
-        {'left': seconds(data, table['start']), 'right': seconds(data, table['end']),
-         'waited': (table['start'] - table['ready']) / 1e9, 'worker': workers,
-         'workers': (n + spare - on).astype(np.int32), 'callbacks': ys[column['vertex'].values],
-         'name': column['vertex'].values.astype(np.int32),
-         'dag': np.where(declared, column['dag'].values, -1).astype(np.int32),
-         'job': table['job'].astype(np.float64),
-         'release': np.where(known, seconds(data, column['release_ns'].values), np.nan),
-         'verdict': leads_to.astype(np.int32), 'class': colour.astype(np.int32)},
-        {'x': seconds(data, marked_at), 'workers': np.zeros(len(worst)),
-         'callbacks': ys[misses['sink']], 'verdict': worst.astype(np.int32)},
-        lines, _worker_lines(data, spare), n_hidden, misses,
-        _meta(data, names, worst.tolist()))
-
-
-def seconds(data: ReportData, times: Any) -> Any:
-    """Return times of the recording in seconds since its start."""
-    return (times - (data.replay.recording.start or 0)) / 1e9
-
-
-def _worst_misses(verdicts: Table) -> Ints:
-    """Return the rows of the worst missed deadlines, in the order of their releases."""
     missed = np.flatnonzero(verdicts['kind'] != SINK_IN_TIME)
-    deadline, completed = verdicts['deadline'][missed], verdicts['completed'][missed]
-    done = completed >= 0
-    worst = missed[np.lexsort((deadline, np.where(done, deadline - completed, 0), done))]
-    worst = worst[:MOST_MISSES]
+    release, deadline, until, sink = (
+        verdicts[name][missed] for name in ('release', 'deadline', 'until', 'sink'))
+    late = (until - deadline) / np.maximum(1, deadline - release)
+    late = np.where(verdicts['completed'][missed] < 0, np.maximum(1, late), late)
+    order = np.lexsort((release, -late, sink))
+    rank = np.empty(len(missed), dtype=np.int64)
+    for mine in rows_by(sink[order], int(sink.max(initial=0)) + 1):
+        rank[order[mine]] = np.arange(len(mine))
+    worst = missed[np.lexsort((release, -late, rank))[:MOST_MISSES]]
     return worst[np.lexsort((verdicts['sink'][worst], verdicts['release'][worst]))]
+
+
+def page_data(data: ReportData, misses: Ints) -> dict[str, Any]:
+    """
+    Return what the page's script draws, ready for JSON.
+
+    :param misses: the listed misses, rows of ``data.timeline.verdicts``.
+    """
+    verdicts, task_set = data.timeline.verdicts, data.replay.task_set
+    columns, rows = executions(data.replay, data.timeline.rows)
+    column = {each.name: each for each in columns}
+    order = np.argsort(column['start_ns'].values, kind='stable')
+    table = data.replay.recording.executions[rows[order]]
+    names = [printable(name) for name in column['vertex'].names]
+    lines, line_of = _lines(data, names)
+    declared = [vertex.name for vertex in task_set.vertices]
+    short = short_names(declared)
+    leads_to, colour = _verdicts_of(data, table)
+    start, n = _since(data, table['start']), data.result['workers']
+    workers = [printable(name) for name in data.worker_names] or [f'worker {w}' for w in range(n)]
+    on = table['worker'].astype(np.int64)
+    spare = (on < 0) | (on >= len(workers))
+    known = column['release_ns'].known
+    release = column['release_ns'].values[order]
+    waited = np.where(spare & (table['ready'] < 0), 0, table['start'] - table['ready'])
+    response = verdicts['completed'] - verdicts['release']
+    deadlines = data.replay.judged.tables.sink_deadline
+    return {
+        'duration': max(1, data.duration_ns), 'declared': len(declared), 'names': names,
+        'short': [printable(short[name]) for name in declared],
+        'dags': [printable(dag.name) for dag in task_set.dags],
+        'dagOf': [vertex.dag for vertex in task_set.vertices],
+        'deadlines': [int(deadlines[i]) for i in range(len(declared))],
+        'workers': workers + ['spare threads'] * bool(spare.any()),
+        'lines': lines, 'lineOf': line_of, 'kinds': [VERDICTS[kind] for kind in sorted(VERDICTS)],
+        'executions': {
+            'start': np.diff(start, prepend=0).tolist(),
+            'ran': (table['end'] - table['start']).tolist(), 'waited': waited.tolist(),
+            'worker': np.where(spare, len(workers), on).tolist(),
+            'name': column['vertex'].values[order].tolist(), 'job': table['job'].tolist(),
+            'released': [before if there else None for before, there in zip(
+                (table['start'] - release).tolist(),
+                np.ones(len(release), bool) if known is None else known[order])],
+            'verdict': leads_to.tolist(), 'colour': colour.tolist()},
+        'verdicts': {
+            'sink': verdicts['sink'].tolist(), 'job': verdicts['job'].tolist(),
+            'release': _since(data, verdicts['release']).tolist(),
+            'response': [None if never else took for never, took in zip(
+                (verdicts['completed'] < 0).tolist(), response.tolist())],
+            'kind': verdicts['kind'].tolist()},
+        'misses': misses.tolist(),
+        'gaps': [[int(_since(data, time)) for time in gap] for gap in data.timeline.gaps],
+        'busy': _over_time(data, data.timeline.busy_over_time),
+        'late': _over_time(data, data.timeline.missed_over_time),
+        'histograms': list(_histograms(data))}
+
+
+def _since(data: ReportData, times: Any) -> Any:
+    """Return times of the recording since its start, ns."""
+    return times - (data.replay.recording.start or 0)
+
+
+def _over_time(data: ReportData, use: PoolUse) -> dict[str, Any]:
+    """Return the begin of the first step, the length of all, and the sum of each (ns)."""
+    return {'start': int(_since(data, use.start or 0)), 'step': int(use.step),
+            'sums': [int(each) for each in use.busy]}
 
 
 def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:
     """
     Return by execution the row of the shown verdict with the least slack that it leads to.
 
-    It is -1 without such a verdict. Also return the index of the colour.
+    It is -1 without such a verdict. Also return the index of the class.
     """
     verdicts, first_vertex = data.timeline.verdicts, data.replay.judged.tables.first_vertex
     share = np.where(
         verdicts['completed'] < 0, -np.inf, (verdicts['deadline'] - verdicts['completed'])
         / np.maximum(1, verdicts['deadline'] - verdicts['release']))
     found, least = np.full(len(table), -1), np.full(len(table), np.inf)
-    for dag, first in zip(data.replay.task_set.dags, first_vertex):
+    of_dag = rows_by(table['dag'] + 1, len(data.replay.task_set.dags) + 1)[1:]
+    of_sink = rows_by(verdicts['sink'], len(data.replay.task_set.vertices))
+    for dag, first, rows in zip(data.replay.task_set.dags, first_vertex, of_dag):
         for sink in dag.sinks:
-            mine = np.flatnonzero(np.isin(table['vertex'] - first, _ancestors(dag, sink)))
-            judged = np.flatnonzero(verdicts['sink'] == first + sink)
+            mine = rows[np.isin(table['vertex'][rows] - first, _ancestors(dag, sink))]
+            judged = of_sink[first + sink]
             at = look_up(verdicts['job'][judged], table['job'][mine])
             mine, judged = mine[at >= 0], judged[at[at >= 0]]
             nearer = share[judged] < least[mine]
             found[mine[nearer]], least[mine[nearer]] = judged[nearer], share[judged[nearer]]
     return found, np.where(
-        found < 0, len(COLOURS) - 1, np.searchsorted(_SHARES, least, 'right'))
+        found < 0, len(COLOURS) - 1, np.searchsorted(SHARES, least, 'right'))
 
 
 def _ancestors(dag: Dag, sink: int) -> list[int]:
@@ -165,27 +194,6 @@ def _ancestors(dag: Dag, sink: int) -> list[int]:
         seen.update(more)
         found += more
     return found
-
-
-def _meta(data: ReportData, names: list[str], worst: list[int]) -> dict[str, Any]:
-    """Return the tables for the texts of the page's script; releases in s, other times in ns."""
-    task_set, verdicts = data.replay.task_set, data.timeline.verdicts
-    declared = [vertex.name for vertex in task_set.vertices]
-    short = short_names(declared)
-    responses = (verdicts['completed'] - verdicts['release']).tolist()
-    return {
-        'duration': data.duration_ns / 1e9, 'declared': len(declared), 'names': names,
-        'short': [printable(short[name]) for name in declared],
-        'dags': [printable(dag.name) for dag in task_set.dags],
-        'workers': [printable(name) for name in data.worker_names],
-        'verdicts': list(zip(
-            *(verdicts[name].tolist() for name in ('sink', 'dag', 'job')),
-            seconds(data, verdicts['release']).tolist(),
-            (verdicts['deadline'] - verdicts['release']).tolist(),
-            [None if completed < 0 else response
-             for completed, response in zip(verdicts['completed'].tolist(), responses)],
-            [VERDICTS[kind] for kind in verdicts['kind'].tolist()])),
-        'missed': worst}
 
 
 def json_for_html(value: Any) -> str:
@@ -199,35 +207,70 @@ def label(text: str, longest: int = LONGEST_LABEL) -> str:
     return shortened(printable(text), longest)
 
 
-def _lines(data: ReportData, names: list[str]) -> tuple[list[Line], Any, int]:
+def _lines(data: ReportData, names: list[str]) -> tuple[list[Line], list[int]]:
     """
     Return the lines of the timeline by callback, from the top: the worst DAGs come first.
 
-    Also return the position of each name, and the number of names without a line.
+    Also return the line of each name.
     """
     dags, sinks = data.replay.task_set.dags, data.result['dags']
     short = short_names(vertex.name for dag in dags for vertex in dag.vertices)
-    texts: list[tuple[str, bool]] = []
-    rows = np.zeros(len(names), dtype=np.int32)
+    lines: list[Line] = []
+    line_of = [0] * len(names)
     for dag in sorted(dags, key=lambda dag: -max(
             missed_share(counts(sink)) for sink in sinks[dag.name]['sinks'].values())):
-        first = data.replay.judged.tables.first_vertex[dag.index]
-        texts.append((f'{dag.name}, every {format_ns(dag.period_ns)}', True))
-        rows[first:first + len(dag.vertices)] = len(texts) + np.arange(len(dag.vertices))
-        texts += [(short[vertex.name], False) for vertex in dag.vertices]
+        first, name = data.replay.judged.tables.first_vertex[dag.index], printable(dag.name)
+        every = f'every {format_ns(dag.period_ns)}'
+        if len(dag.vertices) == 1:      # needs no title
+            line_of[first] = len(lines)
+            one = short[dag.vertices[0].name]
+            lines.append(Line(f'{label(one, LONGEST_LABEL - len(every) - 2)}, {every}', False,
+                              name))
+            continue
+        lines.append(Line(label(f'{dag.name}, {every}'), True, name))
+        for place, vertex in enumerate(dag.vertices):
+            line_of[first + place] = len(lines)
+            lines.append(Line(label(short[vertex.name]), False, name))
     n_declared = len(data.replay.task_set.vertices)
-    others = names[n_declared:]
-    texts += [('undeclared', True)] * bool(others)
-    rows[n_declared:] = len(texts) + np.arange(len(others))
-    texts = [*texts, *((name, False) for name in others)][:MOST_LINES]
-    top = len(texts) - 1
-    return ([Line(label(text), top - i, heading) for i, (text, heading) in enumerate(texts)],
-            np.where(rows > top, _HIDDEN, top - rows), int((rows > top).sum()))
+    if names[n_declared:] and dags:
+        lines.append(Line('undeclared', True, 'undeclared'))
+    for number, name in enumerate(names[n_declared:], n_declared):
+        line_of[number] = len(lines)
+        lines.append(Line(label(name), False, 'undeclared'))
+    return lines, line_of
 
 
-def _worker_lines(data: ReportData, spare: int) -> list[Line]:
-    """Return the lines of the timeline by worker; at the bottom are the missed deadlines."""
-    n = data.result['workers']
-    names = [printable(name) for name in data.worker_names] or [f'worker {w}' for w in range(n)]
-    names += ['spare threads'] * spare + ['missed deadlines']
-    return [Line(name, len(names) - 1 - i) for i, name in enumerate(names)]
+# --- histograms ----------------------------------------------------------------------------------
+
+def _histograms(data: ReportData) -> Iterator[dict[str, Any]]:
+    """Yield the histograms of response times, of the sinks with the least slack first."""
+    tally = data.replay.tally
+    short = short_names(tally.vertex_name(vertex) for vertex in tally.sinks)
+    sinks = [(short[tally.vertex_name(vertex)], sink)
+             for vertex, sink in tally.sinks.items() if sink.responses]
+    sinks.sort(key=lambda item: -(item[1].longest or 0) / max(1, item[1].relative_deadline_ns))
+    for name, sink in sinks[:MOST_HISTOGRAMS]:
+        yield histogram(label(name), sink)
+
+
+def histogram(title: str, tally: SinkTally) -> dict[str, Any]:
+    """
+    Return a histogram of response times.
+
+    ``bars`` are pairs of the index of a bar and the number of jobs; all bars are ``width`` ns
+    wide. The deadline is a multiple of the width, so no bar is partly late. Responses far beyond
+    the deadline are left out of the bars; ``later`` has their number, the least and the largest.
+    """
+    deadline = max(1, tally.relative_deadline_ns)
+    responses = np.sort(np.fromiter(
+        tally.responses, dtype=np.int64, count=len(tally.responses)))
+    longest = int(responses[-1])
+    limit = min(longest, max(4 * deadline, int(1.5 * responses[len(responses) // 2])))
+    width = deadline / min(_MOST_BARS, max(1, round(_BARS * deadline / max(deadline, limit))))
+    places = np.floor(np.maximum(responses - 1, 0) / width).astype(np.int64)
+    last = min(max(int(limit // width), round(deadline / width) - 1), _MOST_BARS - 1)
+    inside, later = places[places <= last], responses[places > last]
+    bars, jobs = np.unique(inside, return_counts=True)
+    return {'title': f'{title}: deadline {format_ns(deadline)}', 'deadline': deadline,
+            'width': width, 'bars': list(zip(bars.tolist(), jobs.tolist())),
+            'later': [len(later), int(later[0]), int(later[-1])] if len(later) else None}

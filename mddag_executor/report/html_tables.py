@@ -9,7 +9,8 @@ from html import escape
 from pathlib import Path
 
 from mddag_executor.core.tally import counts, total, VERDICTS
-from mddag_executor.report.html_data import BLUE, ORANGE, Prepared, RED, ReportData, seconds
+from mddag_executor.recording.tables import Table
+from mddag_executor.report.html_data import ReportData, slack_class
 from mddag_executor.report.replays import callbacks_table, times_table
 from mddag_executor.report.tables import (
     each_sink,
@@ -23,7 +24,7 @@ from mddag_executor.text import counted
 
 _STYLE = Path(__file__).with_name('html.css')
 MOST_ROWS = 50
-"""Number of sinks in the page itself; a script adds the others."""
+"""Number of rows that a table of sinks shows at first."""
 
 
 class Html(str):
@@ -37,6 +38,7 @@ def page_head(title: str) -> str:
     return (f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
             f'<title>{title}</title>'
             '\n<meta name="viewport" content="width=device-width">\n'
+            '<meta name="color-scheme" content="light dark">\n'
             '<link rel="icon" href="data:,">\n'
             f'<style>{_STYLE.read_text(encoding="utf-8")}</style>\n')
 
@@ -98,12 +100,26 @@ def worst_line(data: ReportData) -> Iterator[str]:
         f'the deadline of {format_ns(worst.result["relative_deadline_ns"])}'))
 
 
-def sinks_html(data: ReportData) -> str:
+def data_table(
+    table: str, search: str = '', more: int = 0, name: str = 'data', note: str = ''
+) -> str:
     """
-    Return the table of sinks, the worst ones first: verdicts and response times.
+    Return a table that the page's script makes sortable and searchable.
 
-    The page's script shows the rows after the first ``MOST_ROWS`` on demand.
+    :param search: what its search box is for; empty: it has none.
+    :param more: the number of rows if some of them are hidden at first.
+    :param note: markup next to the search box.
     """
+    box = (f'<input type="search" placeholder="{escape(search)}" aria-label="{escape(search)}"> '
+           if search else '')
+    button = f'<button type="button" class="all">show all {more}</button> ' if more else ''
+    head = f'<p class="search">{box}{button}<span class="note">{note}</span></p>\n'
+    return (f'<div class="data" id="mddag-{name}">\n{head if box or button or note else ""}'
+            f'<div class="scroll" tabindex="0">{table}</div></div>\n')
+
+
+def sinks_html(data: ReportData) -> str:
+    """Return the table of sinks, the worst ones first: verdicts and response times."""
     columns, cells = sink_columns(data.result['dags'])
     header = ['DAG', 'sink', *columns]
     ranked = _ranked(data)
@@ -111,53 +127,56 @@ def sinks_html(data: ReportData) -> str:
             for sink in ranked]
     shown = html_table(
         [*header, 'max of deadline'], rows, 2, range(header.index('late'), header.index('median')),
-        [f'data-reached="{_reached(sink):.4f}"{" hidden" * (i >= MOST_ROWS)}'
+        [f'data-dag="{escape(printable(sink.dag))}"' + ' hidden' * (i >= MOST_ROWS)
          for i, sink in enumerate(ranked)])
-    more = (f'<button id="mddag-all-sinks">show all {len(rows)}</button>'
-            if len(rows) > MOST_ROWS else '')
-    return ('<p class="search"><input id="mddag-search" type="search" placeholder="search sinks" '
-            f'aria-label="search sinks"> {more} <span class="note">The worst ones come first; '
-            'click on a title to sort.</span></p>\n'
-            f'<div class="wide" id="mddag-sinks">{shown}</div>\n')
+    return data_table(
+        shown, 'search sinks', len(rows) if len(rows) > MOST_ROWS else 0, 'sinks',
+        'The worst ones come first. Click on a title to sort, on a sink to see its DAG in the '
+        'timeline by callback.')
 
 
 def _reached_bar(share: float) -> Html:
-    """Return a bar from 0 to the deadline, red beyond it."""
-    colour = RED if share > 1 else ORANGE if share > 0.9 else BLUE
-    return bar(share, colour, f'{100 * share:.0f} %')
+    """Return a bar from 0 to the deadline, in the colour of the slack that is left."""
+    return bar(share, slack_class(1 - share), f'{100 * share:.0f} %')
 
 
-def bar(share: float, colour: str, text: str) -> Html:
-    """Return a bar with a text next to it; at most its whole width is filled."""
-    return Html(f'<span class="bar"><i style="width:{100 * min(1.0, share):.1f}%;'
-                f'background:{colour}"></i></span><b>{text}</b>')
+def bar(share: float, kind: str, text: str) -> Html:
+    """Return a bar of a class with a text next to it; at most its whole width is filled."""
+    return Html(f'<span class="bar"><i class="{kind}" style="width:{100 * min(1.0, share):.1f}%">'
+                f'</i></span><b>{text}</b>')
 
 
-def misses_html(data: ReportData, prepared: Prepared) -> str:
-    """Return the table of the worst misses, by time."""
+def misses_html(data: ReportData, misses: Table) -> str:
+    """Return the table of the listed misses, by time."""
     if not data.timeline.n_missed:
         return ('<p class="note">No deadline was missed.</p>\n' if total(data.result['dags']).due
                 else '<p class="note">No job was due at any sink: nothing is proven.</p>\n')
-    task_set = data.replay.task_set
-    short = short_names(vertex.name for vertex in task_set.vertices)
-    header = ('DAG', 'sink', 'verdict', *(['cause'] if data.causes else []), 'job', 'released at',
+    task_set, start = data.replay.task_set, data.replay.recording.start or 0
+    short = short_names([*(vertex.name for vertex in task_set.vertices), *data.behind.values()])
+    more = [(title, of) for title, of in (('cause', data.causes), ('mostly behind', data.behind))
+            if of]
+    header = ('DAG', 'sink', 'verdict', *(title for title, _ in more), 'job', 'released at',
               'response', 'late by')
     rows = []
-    for miss in prepared.misses:
+    for miss in misses:
         sink, job, release, deadline, completed = (int(miss[name]) for name in (
             'sink', 'job', 'release', 'deadline', 'completed'))
+        why = (of.get((sink, job)) for _, of in more)
         rows.append((
             task_set.dags[miss['dag']].name, short[task_set.vertices[sink].name],
-            VERDICTS[miss['kind']], *([data.causes.get((sink, job))] if data.causes else []), job,
-            f'{seconds(data, release):.6f} s',
+            VERDICTS[miss['kind']], *(text and short.get(text, text) for text in why), job,
+            f'{(release - start) / 1e9:.6f} s',
             *(None if completed < 0 else format_ns(completed - since, 3)
               for since in (release, deadline))))
     what = 'All' if len(rows) == data.timeline.n_missed else (
-        f'The {len(rows)} worst of {data.timeline.n_missed}')
-    table = html_table(header, rows, 3 + bool(data.causes),
-                       attributes=[f'data-miss="{i}"' for i in range(len(rows))])
-    return (f'<h2>Missed deadlines</h2>\n<p class="note">{what} in the order of time; click on '
-            f'one to see it in the timeline.</p>\n<div class="scroll">{table}</div>\n')
+        f'{len(rows)} of {data.timeline.n_missed} (the worst of each sink come first into this '
+        'list)')
+    table = html_table(header, rows, 3 + len(more),
+                       attributes=[f'data-miss="{i}" tabindex="0"' for i in range(len(rows))])
+    return '<h2>Missed deadlines</h2>\n' + data_table(
+        table, 'search misses', 0, 'misses',
+        f'{what}, in the order of time. Click on a title to sort, on a miss to see it in the '
+        'timeline.')
 
 
 def worst_html(data: ReportData) -> str:
@@ -167,7 +186,7 @@ def worst_html(data: ReportData) -> str:
     found = sorted(data.replay.chains.breakdown().items(), key=lambda item: (
         item[1]['worst']['release_ns'] - item[1]['worst']['completed_ns']) / deadlines[item[0]])
     rows = [(short[vertices[sink].name], each) for sink, each in found[:MOST_ROWS]]
-    return f'<div class="wide">{html_table(*times_table(rows, "worst"), 1)}</div>'
+    return data_table(html_table(*times_table(rows, 'worst'), 1), name='worst')
 
 
 def callbacks_html(data: ReportData) -> str:
@@ -177,4 +196,5 @@ def callbacks_html(data: ReportData) -> str:
     undeclared = usage.undeclared()
     if undeclared['executions'] and usage.callbacks():
         callbacks = {**callbacks, 'undeclared callbacks': undeclared}
-    return f'<div class="scroll">{html_table(*callbacks_table(callbacks), 1)}</div>\n'
+    return data_table(html_table(*callbacks_table(callbacks), 1), 'search callbacks',
+                      name='callbacks')

@@ -77,14 +77,20 @@ def callbacks_table(
     return [_CALLBACKS[i] for i in known], [[row[i] for i in known] for row in rows]
 
 
-def communications_table(communications: Iterable[Mapping[str, Any]]) -> str:
-    """Return a table of messages, from publication to callback; those of ROS itself come last."""
+def communications_table(
+    communications: Iterable[Mapping[str, Any]]
+) -> tuple[list[str], list[list[Cell]]]:
+    """
+    Return titles and rows of the table of messages, from publication to callback.
+
+    Those of ROS itself come last.
+    """
     rows: list[list[Cell]] = [
         [each['topic'], each['publisher'], each['callback'], each['sent'], each['arrived'],
          *times(each['latency_ns'], 'min', 'median', 'p99', 'max')]
         for each in sorted(communications, key=lambda each: is_background(each['topic'], ''))]
-    return table(('topic', 'publisher', 'callback', 'sent', 'arrived', 'min', 'median', 'p99',
-                  'max'), rows)
+    return ['topic', 'publisher', 'callback', 'sent', 'arrived', 'min', 'median', 'p99',
+            'max'], rows
 
 
 _CASES = ('all', 'best', 'worst', 'worst_with_external_latency')
@@ -104,7 +110,7 @@ def recorded_tables(result: Mapping[str, Any], callbacks: bool) -> Iterator[str]
             result['callbacks'] or result.get('recorded_callbacks', {})))
     if not result['dags'] and result.get('communications'):
         yield 'Messages, from publication to the start of the callback:'
-        yield communications_table(result['communications'])
+        yield table(*communications_table(result['communications']))
 
 
 def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:

@@ -9,7 +9,6 @@ from html import escape
 import math
 from typing import Any
 
-from mddag_executor.report.html_data import BLUE, ORANGE, RED
 from mddag_executor.report.html_tables import bar, Html, html_table, page_head
 from mddag_executor.report.tables import percent, short_names, times
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
@@ -132,5 +131,5 @@ def _times(factor: float) -> str:
 
 
 def _bar(factor: float, most: float) -> Html:
-    colour = RED if factor < 1.1 else ORANGE if factor < 1.5 else BLUE
-    return bar(math.log(factor) / math.log(most), colour, _times(factor))
+    kind = 'missed' if factor < 1.1 else 'least' if factor < 1.5 else 'most'
+    return bar(math.log(factor) / math.log(most), kind, _times(factor))

@@ -191,8 +191,6 @@ def files(folder, call):
     pytest.param(name, marks=[pytest.mark.needs('babeltrace2')] * (name == 'import_ctf'))
     for name in COMMANDS])
 def test_output(name, files, call, monkeypatch):
-    if '.html' in COMMANDS[name]:
-        pytest.importorskip('bokeh', reason='Bokeh is not installed')
     if name.startswith('check'):
         monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)
     found = ''

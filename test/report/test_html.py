@@ -10,24 +10,26 @@ import re
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE
 from mddag_executor.replay import replay
 from mddag_executor.report import html
 from mddag_executor.report.diff import callbacks_table, compare, sinks_table
 from mddag_executor.report.html_data import (
     COLOURS,
+    histogram,
     json_for_html,
     label,
     MOST_MISSES,
-    prepare,
-    UNKNOWN,
+    page_data,
+    shown_misses,
 )
 from mddag_executor.report.html_tables import html_table
 import msg_graph
+import numpy as np
 import pytest
 
+from ..replay.recorded import four_jobs
 from . import runs
-
-pytest.importorskip('bokeh', reason='Bokeh is not installed')
 
 
 class Page(HTMLParser):
@@ -47,25 +49,104 @@ class Page(HTMLParser):
             self.texts.append(data)
 
 
+def written(data):
+    file = io.BytesIO()
+    html.write(file, data)
+    return file.getvalue().decode()
+
+
+def drawn(data):
+    return page_data(data, shown_misses(data.timeline.verdicts))
+
+
 def test_what_is_in_the_file_is_what_ran(tmp_path):
-    prepared = prepare(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap'))))
-    found = prepared.executions
-    assert found['left'] == pytest.approx([0, 0.002, 0.010, 0.013, 0.020, 0.027, 0.031])
-    assert found['right'] == pytest.approx([0.001, 0.005, 0.012, 0.016, 0.026, 0.030, 0.033])
-    red, light, grey = (COLOURS.index(each) for each in ('#d7191c', '#9ecae1', UNKNOWN))
-    assert found['class'].tolist() == [light, light, light, light, red, red, grey]
-    # workers from the top, then spare threads; the misses are below all
-    assert found['workers'].tolist() == [3, 2, 3, 2, 3, 2, 1]
-    assert found['callbacks'].tolist() == [3, 2, 3, 2, 3, 2, 0]
-    missed = [prepared.meta['verdicts'][place] for place in prepared.meta['missed']]
-    assert missed == [(1, 0, 2, pytest.approx(0.020), 8 * runs.MS, 10 * runs.MS, 'late')]
-    assert prepared.marks['x'] == pytest.approx([0.030])
+    found = drawn(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap'))))
+    bars = found['executions']
+    start = np.cumsum(bars['start'])
+    assert (start / runs.MS).tolist() == [0, 2, 10, 13, 20, 27, 31]
+    assert ((start + bars['ran']) / runs.MS).tolist() == [1, 5, 12, 16, 26, 30, 33]
+    missed, more, unknown = map(COLOURS.index, ('missed', 'more', 'unknown'))
+    assert bars['colour'] == [more, more, more, more, missed, missed, unknown]
+    assert [found['workers'][each] for each in bars['worker']] == [
+        *['worker 0', 'worker 1'] * 3, 'spare threads']
+    assert [found['lines'][found['lineOf'][each]].label for each in bars['name']] == [
+        *['driver:tick', 'filter:run'] * 3, 'extra']
+    verdicts, (place,) = found['verdicts'], found['misses']
+    assert {name: column[place] for name, column in verdicts.items()} == {
+        'sink': 1, 'job': 2, 'release': 20 * runs.MS, 'response': 10 * runs.MS,
+        'kind': found['kinds'].index('late')}
+    assert found['deadlines'][1] == 8 * runs.MS
+
+
+class Responses:
+    """What a histogram needs of a sink."""
+
+    def __init__(self, deadline_ms, *responses_ms):
+        self.relative_deadline_ns = deadline_ms * runs.MS
+        self.responses = [ms * runs.MS for ms in responses_ms]
+
+
+@pytest.mark.parametrize('responses', [
+    [5] * 100 + [20_000] * 3 + [60_000] * 2, [5, 60_000], [60_000], [1, 10, 11], [3], [10]])
+def test_a_histogram_says_where_each_response_is(responses):
+    found = histogram('sink', Responses(10, *responses))
+    width, later = found['width'], found['later'] or [0, 0, 0]
+    shown = [(place * width / runs.MS, (place + 1) * width / runs.MS, n)
+             for place, n in found['bars']]
+    for low, high, n in shown:
+        assert sum(low < each * (1 + 1e-9) and each * (1 - 1e-9) <= high
+                   for each in responses) == n
+        assert high <= 10 * (1 + 1e-9) or low >= 10 * (1 - 1e-9)      # in time, or late
+    n_later, least, most = later
+    assert n_later + sum(n for *_, n in shown) == len(responses)
+    if n_later:
+        assert sorted(responses)[-n_later] * runs.MS == least
+        assert max(responses) * runs.MS == most
+
+
+def test_each_sink_that_misses_is_in_the_list_of_misses():
+    """One sink is late by seconds in many jobs, others by little, or never complete."""
+    jobs = [(0, 10_000, 5_000), *[(0, 10, 3_000)] * 600, *((sink, 10, 11) for sink in (1, 2)),
+            (3, 10, None), (4, 10, 9)]
+    verdicts = np.zeros(len(jobs), dtype=[(name, 'i8') for name in (
+        'sink', 'release', 'deadline', 'until', 'completed', 'kind')])
+    for row, (sink, deadline, completed) in zip(verdicts, jobs):
+        late = completed is None or completed > deadline
+        row['sink'], row['deadline'], row['kind'] = sink, deadline, SINK_LATE * late
+        row['completed'] = -1 if completed is None else completed
+        row['until'] = deadline if completed is None else completed
+    assert SINK_IN_TIME == 0
+    shown = verdicts[shown_misses(verdicts)]
+    assert len(shown) == MOST_MISSES and set(shown['sink'].tolist()) == {0, 1, 2, 3}
+
+
+def test_bars_of_the_table_have_the_colours_of_the_legend(tmp_path):
+    text = written(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap', took=(1, 2, 3)))))
+    assert '<i class="least"' in text       # 7 of 8 ms: 12.5 % are left
+    legend = text[text.index('class="legend"'):]
+    assert '<i class="least"></i>slack below 10 %' in legend
+
+
+def test_a_run_without_graph_shows_its_messages_and_nothing_of_misses(tmp_path):
+    path = tmp_path / 'run.mcap'
+    four_jobs(path)
+    text = written(html.of_outcome(replay(path)))
+    assert '0.000' not in text[:text.index('<script')]
+    assert 'utilisation by all callbacks</b> 0.037' in text
+    assert '<h2>Messages</h2>' in text and '>/detect subscription /image<' in text
+    for name in ('mddag-next', 'mddag-previous', 'class="missed"', '<h2>Missed', 'class="gap"'):
+        assert name not in text[:text.index('<script')], name
+
+
+def test_what_is_left_out_is_hatched_and_in_the_legend(tmp_path, monkeypatch):
+    monkeypatch.setattr('mddag_executor.report.timeline.Timeline.__init__.__defaults__', (20, 5))
+    data = html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap', took=[2] * 60)))
+    assert drawn(data)['gaps'] and '</i>executions left out' in written(data)
 
 
 def test_a_page_needs_nothing_but_itself_and_hostile_names_stay_text(tmp_path):
-    file = io.BytesIO()
-    html.write(file, html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap', hostile=True))))
-    page = Page(file.getvalue().decode())
+    page = Page(written(html.of_outcome(
+        replay(runs.by_hand(tmp_path / 'run.mcap', hostile=True)))))
     assert any(tag == 'script' for tag, _ in page.elements)
     for tag, attributes in page.elements:
         assert tag not in ('iframe', 'object', 'embed', 'base')
@@ -96,10 +177,8 @@ def test_a_run_without_anything_has_a_report_too():
     task_set = runs.autoware()
     load, run = runs.simulated(task_set, ms=1, workers=1)
     data = html.of_run(task_set, load._replace(times=[], dags=[], jobs=[]), run)
-    assert len(prepare(data).misses) == min(MOST_MISSES, data.timeline.n_missed)
-    file = io.BytesIO()
-    html.write(file, data)
-    assert b'</html>' in file.getvalue()
+    assert len(drawn(data)['misses']) == min(MOST_MISSES, data.timeline.n_missed)
+    assert '</html>' in written(data)
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ import pytest
 
 from . import runs
 
-pytest.importorskip('bokeh', reason='Bokeh is not installed')
 webdriver = pytest.importorskip('selenium.webdriver', reason='selenium is not installed')
 
 pytestmark = pytest.mark.needs('chromium')
@@ -74,10 +73,6 @@ def status(browser):
     return browser.execute_script('return document.getElementById("mddag-status")?.textContent')
 
 
-def bars(browser, column):
-    return browser.execute_script(f'return Array.from(mddag.bars.data.{column})')
-
-
 def write(path, data):
     with path.open('wb') as file:
         html.write(file, data)
@@ -102,14 +97,15 @@ def large(tmp_path_factory):
 
 def test_a_miss_is_told_and_names_cannot_become_markup(browser, small):
     opened(browser, small)
-    texts = [' | '.join(lines) for lines in zip(*(bars(browser, key) for key in 'abcd'))]
+    texts = [text.replace('\n', ' | ') for text in browser.execute_script(
+        'return mddag.data.executions.name.map((_, i) => mddag.barText(i))')]
     assert len(texts) == 7
     assert texts[5] == (
         '/filter:run | job 2 of /driver, released at 0.020000 s | started 0.027000 s on worker 1, '
         'waited 1 ms, ran 3 ms | MISSED at filter:run: response 10 ms, 2 ms late (deadline 8 ms)')
     assert 'in time at filter:run: response 5 ms, 3 ms of slack' in texts[0]
     assert 'window.hacked=1' in texts[6] and 'declared by no DAG' in texts[6]
-    point_at(browser, 'callbacks', 0.032, 0)
+    point_at(browser, 'callbacks', 32 * runs.MS, 4)
     tip = wait_for(lambda: shown_tip(browser))
     assert 'declared by no DAG' in tip and '<img src=x onerror="window.hacked=1">' in tip
     assert browser.execute_script('return window.hacked === undefined')
@@ -117,37 +113,49 @@ def test_a_miss_is_told_and_names_cannot_become_markup(browser, small):
     assert complaints(browser) == []
 
 
-def point_at(browser, name, x, y):
-    """Move the mouse to a place of a picture, given as its axes have it."""
-    from selenium.webdriver.common.action_chains import ActionChains
+def point_at(browser, name, ns, line):
+    """Move the mouse to a time on a line of a picture."""
     from selenium.webdriver.common.actions.action_builder import ActionBuilder
     where = browser.execute_script("""
-        for (const view of Bokeh.index) {
-          if (view.model.name !== arguments[0]) continue;
-          view.el.scrollIntoView({block: 'center'});
-          const box = view.el.getBoundingClientRect();
-          return [box.left + view.frame.x_scale.compute(arguments[1]),
-                  box.top + view.frame.y_scale.compute(arguments[2])];
-        }""", name, x, y)
+        const {canvas} = mddag.pictures[arguments[0]];
+        canvas.scrollIntoView({block: 'center'});
+        const box = canvas.getBoundingClientRect();
+        return [box.left + mddag.xOf(canvas.clientWidth)(arguments[1]),
+                box.top + (arguments[2] + 0.5) * 17];
+        """, name, ns, line)
     actions = ActionBuilder(browser)
     actions.pointer_action.move_to_location(round(where[0]), round(where[1]) + 1)
     actions.pointer_action.move_to_location(round(where[0]), round(where[1]))
     actions.perform()
-    ActionChains(browser).pause(0.05).perform()
 
 
 def shown_tip(browser):
     """Return the text of the tool tip that is shown."""
     return browser.execute_script("""
-        const found = [];
-        const search = (root) => root.querySelectorAll('*').forEach((element) => {
-          if (element.classList.contains('bk-Tooltip')) {
-            found.push((element.shadowRoot || element).textContent);
-          }
-          if (element.shadowRoot) search(element.shadowRoot);
-        });
-        search(document);
-        return found.join(' ');""")
+        const tip = document.getElementById('mddag-tip');
+        return tip.hidden ? '' : tip.textContent;""")
+
+
+def colours_of(browser, name):
+    """Return how many pixels of a picture have each colour."""
+    return browser.execute_script("""
+        const canvas = document.getElementById(`mddag-${arguments[0]}`), found = {};
+        const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+        for (let i = 0; i < data.length; i += 4) {
+          const colour = '#' + [0, 1, 2].map(
+            (c) => data[i + c].toString(16).padStart(2, '0')).join('');
+          if (data[i + 3] === 255) found[colour] = (found[colour] || 0) + 1;
+        }
+        return found;""", name)
+
+
+def view(browser):
+    return browser.execute_script('return [mddag.view.from, mddag.view.to]')
+
+
+def press(browser, key):
+    from selenium.webdriver.common.action_chains import ActionChains
+    ActionChains(browser).send_keys(key).perform()
 
 
 @pytest.mark.parametrize('scheme', ['dark', 'light'])
@@ -155,27 +163,56 @@ def test_a_miss_can_be_found(browser, large, scheme):
     browser.execute_cdp_cmd('Emulation.setEmulatedMedia', {
         'features': [{'name': 'prefers-color-scheme', 'value': scheme}]})
     opened(browser, large)
-    shown = browser.execute_script('return Bokeh.documents[0].roots()[0].border_fill_color')
-    assert (shown == '#1b1b1d') is (scheme == 'dark')
+    red = browser.execute_script('return mddag.colours().missed')
+    assert red == {'dark': '#ff5b52', 'light': '#d7191c'}[scheme]
+    for name in ('overview', 'workers', 'callbacks'):
+        wait_for(lambda name=name: colours_of(browser, name).get(red, 0) > 50)
+    for part in ('#mddag-lines', '#mddag-next', 'body'):        # nothing stays white
+        lightness = browser.execute_script("""
+            return getComputedStyle(document.querySelector(arguments[0])).backgroundColor
+              .match(/[0-9]+/g).slice(0, 3).map(Number)""", part)
+        assert (max(lightness) < 140) is (scheme == 'dark'), part
     first = browser.execute_script('return mddag.missed[0]')
     browser.find_element('id', 'mddag-next').click()
     wait_for(lambda: 'MISSED' in status(browser))
     assert status(browser) == first['text']
-    start, end = browser.execute_script('return [mddag.range.start, mddag.range.end]')
-    assert start < first['release'] < first['shown'] < end < start + 2
-    assert browser.execute_script('return mddag.marks.data.x.length') >= 1
+    start, end = view(browser)
+    assert start < first['release'] < first['shown'] < end < start + 2e9
     browser.find_element('id', 'mddag-next').click()
-    second = wait_for(lambda: browser.execute_script(
-        'return mddag.range.start') != start and status(browser))
+    second = wait_for(lambda: view(browser)[0] != start and status(browser))
     browser.find_element('id', 'mddag-previous').click()
-    wait_for(lambda: browser.execute_script('return mddag.range.start') == start)
+    wait_for(lambda: view(browser)[0] == start)
     assert status(browser) != second
+    press(browser, 'n')
+    wait_for(lambda: status(browser) == second)
+    press(browser, '0')
+    assert view(browser) == [0, 4.5e9]
+    press(browser, '+')
+    assert view(browser) == [1.125e9, 3.375e9]
     browser.find_element('id', 'mddag-whole').click()
-    wait_for(lambda: browser.execute_script('return mddag.range.start') == 0)
     wanted = browser.execute_script('return mddag.missed[3].text')
-    browser.execute_script('document.querySelector("[data-miss=\'3\']").click()')
+    browser.find_element('css selector', '[data-miss="3"]').send_keys('\ue007')     # Enter
     wait_for(lambda: status(browser) == wanted)
     assert complaints(browser) == []
+
+
+def test_misses_are_sorted_and_searched(browser, large):
+    opened(browser, large)
+
+    def shown():
+        return browser.execute_script("""
+            return [...document.querySelectorAll('#mddag-misses tbody tr')].filter(
+              (row) => !row.hidden).map((row) => Number(row.dataset.miss));""")
+
+    late = browser.execute_script('return mddag.missed.map((m) => m.shown - m.deadline)')
+    title = browser.find_element('xpath', '//*[@id="mddag-misses"]//th[.="late by"]')
+    title.click()
+    assert [late[i] // 1e7 for i in shown()] == sorted(
+        (each // 1e7 for each in late), reverse=True)
+    title.send_keys('\ue007')
+    assert [late[i] // 1e7 for i in shown()] == sorted(each // 1e7 for each in late)
+    browser.find_element('css selector', '#mddag-misses input').send_keys('no such sink')
+    assert shown() == []
 
 
 def test_many_sinks_are_shown_on_demand_and_found(browser, tmp_path):
@@ -193,12 +230,25 @@ def test_many_sinks_are_shown_on_demand_and_found(browser, tmp_path):
               (row) => row.offsetHeight > 0).map((row) => row.cells[0].textContent);""")
 
     assert len(shown()) == MOST_ROWS
-    browser.find_element('id', 'mddag-search').send_keys('/N5')
+    search = browser.find_element('css selector', '#mddag-sinks input')
+    search.send_keys('/N5')
     assert sorted(shown()) == ['/n5', *(f'/n5{i}' for i in range(10))]
-    browser.find_element('id', 'mddag-search').send_keys('\b\b\b')
+    search.send_keys('\b\b\b')
     assert len(shown()) == 60
     browser.execute_script('document.querySelector("#mddag-sinks th").click()')
     assert shown() == sorted(f'/n{i}' for i in range(60))
     opened(browser, report)
-    browser.find_element('id', 'mddag-all-sinks').click()
-    assert len(shown()) == 60 and complaints(browser) == []
+    browser.find_element('css selector', '#mddag-sinks .all').click()
+    assert len(shown()) == 60
+
+    def lines():
+        return browser.execute_script(
+            'return mddag.pictures.callbacks.lines.map((line) => line.label)')
+
+    assert len(lines()) == 60
+    browser.find_element('css selector', '[data-dag="/n7"]').click()     # its DAG alone
+    assert lines() == ['n7:t, every 17 ms']
+    wanted = browser.find_element('id', 'mddag-lines')
+    wanted.clear()
+    wanted.send_keys('n5')
+    assert len(lines()) == 11 and complaints(browser) == []
