@@ -310,7 +310,7 @@
     steps(data.late, (from, to) => draw.fillRect(from, 2, Math.max(3, to - from), 8));
     draw.restore();
     draw.fillStyle = colours.faint;
-    draw.globalAlpha = 0.22;
+    draw.globalAlpha = 0.15;
     draw.fillRect(LEFT, 0, Math.max(0, x(view.from) - LEFT), height);     // what is not in view
     draw.fillRect(x(view.to), 0, Math.max(0, right - x(view.to)), height);
     draw.globalAlpha = 1;

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE
 from mddag_executor.replay import replay
+from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import html
 from mddag_executor.report.diff import callbacks_table, compare, sinks_table
 from mddag_executor.report.html_data import (
@@ -118,6 +119,24 @@ def test_each_sink_that_misses_is_in_the_list_of_misses():
     assert SINK_IN_TIME == 0
     shown = verdicts[shown_misses(verdicts)]
     assert len(shown) == MOST_MISSES and set(shown['sink'].tolist()) == {0, 1, 2, 3}
+
+
+def test_a_miss_says_behind_whom_it_waited(tmp_path):
+    task_set = msg_graph.loads("""\
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: slow, timer: 100ms, deadline: 100ms, execution_time: 40ms}]}
+  - {node: /b, callbacks: [{name: quick, timer: 20ms, deadline: 10ms, execution_time: 1ms}]}
+""", 'g.yaml')
+    load, run = runs.simulated(task_set, ms=400, workers=1, utilisation=0.45)
+    write_trace(tmp_path / 'run.mcap', task_set, load, run)
+    outcome = replay(tmp_path / 'run.mcap')
+    assert {sink: name for (sink, _), name in outcome.explanation.longest_behind().items()} == {
+        1: '/a:slow'}
+    text = written(html.of_outcome(outcome))
+    misses = text[text.index('id="mddag-misses"'):text.index('id="mddag-sinks"')]
+    assert '>mostly behind<' in misses
+    assert '<td class="text">waited</td><td class="text">a:slow</td>' in misses
 
 
 def test_bars_of_the_table_have_the_colours_of_the_legend(tmp_path):
