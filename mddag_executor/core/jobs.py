@@ -18,6 +18,7 @@ from mddag_executor.core.state import (
     IDLE,
     JOB_END,
     JUDGE_FROM,
+    JUDGE_UNTIL,
     LEADS_OUT,
     NOT_JUDGED,
     OPEN,
@@ -135,8 +136,8 @@ def judge_from(s: State, release: int) -> None:
 
 
 def is_judged(s: State, slot: int) -> bool:
-    """Return whether a job was released after judging began (rule 6)."""
-    return s.job_release[slot] >= s.scalars[JUDGE_FROM]
+    """Return whether a job was released after judging began, and before it ended (rule 6)."""
+    return s.scalars[JUDGE_FROM] <= s.job_release[slot] < s.scalars[JUDGE_UNTIL]
 
 
 def is_miss(kind: int) -> bool:

@@ -39,8 +39,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     the run: an absolute deadline at or before the end was missed.  Each sink of a job gets one
     verdict.  For a driver with a clock (``deadlines``) a sink is *overdue* from its deadline to
     its verdict, which is then not in time.  Jobs released less than ``SKIP`` after the first one
-    (warm-up), or before ``JUDGE_FROM``, get no verdicts; live, ``judge_from`` is called when all
-    programs have started.
+    (warm-up), before ``JUDGE_FROM``, or not before ``JUDGE_UNTIL``, get no verdicts; live,
+    ``judge_from`` is called when all programs have started.
 7.  **Late jobs.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops its waiting executions
     once the miss is known: at a late completion, or when one of them comes first in the ready
     queue after the deadline of an incomplete sink; started ones finish.  ``DEMOTE`` lowers the

@@ -27,7 +27,7 @@ ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # Columns of ``scalars``.  ``FORGET_AT``: until when no measured execution time is too old.
 (ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, SKIP, N_HOLDING, URGENCY, FORGET_AT, N_SCALARS) = range(14)
+ JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY, FORGET_AT, N_SCALARS) = range(15)
 
 # Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
 # them, or deadlines of DAGs.
@@ -181,7 +181,7 @@ def fill_state(
     s.scalars[SWITCH_OVERHEAD] = switch_overhead
     s.scalars[POLLING] = polling
     s.scalars[URGENCY] = urgency
-    s.scalars[JUDGE_FROM] = -NEVER
+    s.scalars[JUDGE_FROM], s.scalars[JUDGE_UNTIL] = -NEVER, NEVER
     s.scalars[FORGET_AT] = NEVER
     for v in range(t.n_vertices + 1):
         s.start_by.append(t.latest_start[v])

@@ -58,7 +58,8 @@ class Replay:
     @cached_property
     def usage(self) -> Usage:
         """Return how much time callbacks and workers used."""
-        return Usage(self.recording, self._waited)
+        end = self.recording.end
+        return Usage(self.recording, self._waited, end - self.duration_ns, end)
 
     @cached_property
     def explanation(self) -> Explanation:
@@ -108,7 +109,7 @@ class Replay:
             **result, 'rescheduled': False, 'skip_ns': self.judged.skip,
             'callbacks': self.usage.callbacks(),
             'undeclared': self.usage.undeclared(),
-            'worker_use': self.usage.workers(head.workers, duration),
+            'worker_use': self.usage.workers(head.workers),
             'dropped': dict(sorted(recording.dropped.items())),
             'messages_lost': recording.messages_lost,
             'misses': self.explanation.summary(),

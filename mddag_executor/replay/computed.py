@@ -55,7 +55,8 @@ class ComputedRun(NamedTuple):
     :ivar horizon: no job is released from then on, ns.
     :ivar end: when it ended, ns; open jobs are then judged if ``judged``.
     :ivar numbers: by DAG the recorded numbers of the load's jobs; None: as in the load.
-    :ivar judge_from: jobs released before are not judged.
+    :ivar judge_from: jobs released before are not judged; ``judged_releases``: range of judged
+        releases, ns; None: all.
     """
 
     task_set: TaskSet
@@ -67,6 +68,7 @@ class ComputedRun(NamedTuple):
     judged: bool = True
     numbers: Sequence[Sequence[int]] | None = None
     judge_from: int = -NEVER
+    judged_releases: tuple[int, int] | None = None
 
     @classmethod
     def of_run(cls, task_set: TaskSet, load: Load, run: SimulatedRun) -> ComputedRun:
@@ -95,7 +97,7 @@ class ComputedRun(NamedTuple):
             demotions=found.demotions(),
             start=tables.earliest(releases['release'], executions['ready']),
             end=self.end, judged=self.judged, judged_until=self.end, workers_each=workers,
-            judge_from=self.judge_from)
+            judge_from=self.judge_from, judged_releases=self.judged_releases)
 
 
 class _Pieces(NamedTuple):

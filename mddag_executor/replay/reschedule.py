@@ -79,12 +79,18 @@ class Reschedule:
         """Return the duration of the recording."""
         return max(0, self.settings.duration_ns - self._run.begin)
 
+    @property
+    def _scheduled_ns(self) -> int:
+        """Return how long callbacks are scheduled: a part has jobs of before its begin, too."""
+        begin = self._run.begin
+        return self.settings.duration_ns - min(begin, *self.work.load.times[:1])
+
     def computed(self) -> ComputedRun:
         """Return the schedule as a computed run."""
         end = self.settings.duration_ns
         return ComputedRun(
             self.task_set, self.work.load, self.log, self.decisions, end, end, True,
-            self.work.jobs, self.settings.judge_from)
+            self.work.jobs, self.settings.judge_from, self._run.judged_releases)
 
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``, including the recorded run."""
@@ -102,7 +108,7 @@ class Reschedule:
             'duration_ns': duration,
             **({'processes': [asdict(each) for each in self.processes]}
                if self.processes else {}),
-            'utilisation': share(work.demand, self.workers, duration),
+            'utilisation': share(work.demand, self.workers, self._scheduled_ns),
             **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self._skip,
             'executions': work.executions, 'estimated_executions': work.estimated,
             **({'skipped_jobs': skipped} if skipped else {}),
@@ -112,7 +118,7 @@ class Reschedule:
                 'transport_median_ns': work.transport_ns},
             'worker_use': {
                 'busy_ns': {str(w): took for w, took in enumerate(self.busy)},
-                'use': share(sum(self.busy), self.workers, duration)},
+                'use': share(sum(self.busy), self.workers, self._scheduled_ns)},
             'recorded': None if self.recorded is None else {
                 'policy': self.recorded.recording.head.policy,
                 'workers': self.recorded.recording.head.workers,
@@ -208,6 +214,7 @@ def reschedule(
     del builder     # the load has copies of its data
     give_back()
     warnings, judge_from = run.warnings, run.begin + skip if skip else -NEVER
+    begin, judge_until = run.judged_releases or (-NEVER, NEVER)
     if recorded is not None:
         warnings, judge_from = recorded.warnings, recorded.judged.judge_from
     if cpus is not None and run.declared and len(work.load.computed) == 0:
@@ -221,7 +228,8 @@ def reschedule(
             + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
     settings = Settings(
         policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
-        judge_from=judge_from, processes=max(1, len(placed)), on_late=on_late)
+        judge_from=max(begin, judge_from), judge_until=judge_until,
+        processes=max(1, len(placed)), on_late=on_late)
     with no_garbage():
         return Reschedule(
             run, work, tables, settings, warnings, skip, overheads, placed, recorded)

@@ -3,12 +3,19 @@
 """
 How much time callbacks and workers used: executions, busy time, waiting, CPU time.
 
-An execution of a declared callback counts when it completes; its time so far always counts.
+Theory of operation
+-------------------
+1. An execution of a declared callback counts when it completes; its time so far always counts.
+2. A callback uses the whole time of its executions, also if the recording is a part of a longer
+   one and they began before it or ended after it.
+3. The workers are busy while they run callbacks, within the span of the recording: each at most
+   all of the time.  A callback that another one runs while it waits (an imported one that spins)
+   uses the time of the same worker.  A callback that has lent its worker (``Client.call``) uses
+   none.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -85,6 +92,30 @@ def group_waits(recording: Recording) -> Ints:
     return waited
 
 
+def worker_spans(
+    recording: Recording, begin: int, end: int, which: Any = True
+) -> dict[int, tuple[Ints, Ints]]:
+    """
+    Return by worker when it ran callbacks from ``begin`` to ``end``: starts and ends, ns (rule 3).
+
+    :param which: the executions that count.
+    """
+    table = recording.executions[['worker', 'start', 'end']]
+    rows = np.flatnonzero(
+        (table['worker'] >= 0) & (table['start'] >= 0) & (table['end'] > begin)
+        & (table['start'] < end) & which)
+    workers, number = different(table['worker'][rows])
+    found = {}
+    for worker, mine in zip(workers.tolist(), rows_by(number, len(workers))):
+        mine = rows[mine]
+        starts, ends = np.maximum(table['start'][mine], begin), np.minimum(table['end'][mine], end)
+        order = sort_by(starts)
+        starts, ends = starts[order], ends[order]
+        starts[1:] = np.maximum(starts[1:], np.maximum.accumulate(ends)[:-1])
+        found[worker] = starts[starts < ends], ends[starts < ends]
+    return found
+
+
 class PoolUse:
     """
     The load of the pool over time: in each step the busy time of all workers together.
@@ -92,17 +123,22 @@ class PoolUse:
     Steps begin at multiples of their length.  With more than ``MOST_STEPS`` the length is doubled.
 
     :param step: initial length, ns.
+    :param begin: when the recording begins, ns: if no worker was busy, the only step is there.
     """
 
     FIRST_STEP_NS = 100_000_000
     MOST_STEPS = 600
 
-    def __init__(self, starts: Ints, ends: Ints, step: int = FIRST_STEP_NS) -> None:
+    def __init__(
+        self, starts: Ints, ends: Ints, step: int = FIRST_STEP_NS, begin: int | None = None
+    ) -> None:
         self.step = step
         self.start: int | None = None
         self.busy: list[int] = []
         spans = list(_spans(starts, ends))
         if not spans:
+            if begin is not None:
+                self.start, self.busy = begin // step * step, [0]
             return
         first = min(int(start.min()) for start, _ in spans)
         last = max(int(end.max()) for _, end in spans) - 1
@@ -130,29 +166,40 @@ def _spans(starts: Ints, ends: Ints) -> Iterator[tuple[Ints, Ints]]:
 
 
 class Usage:
-    """The time that callbacks and workers used in a recording; ``waited``: ``group_waits``."""
+    """
+    The time that callbacks and workers used in a recording.
 
-    def __init__(self, recording: Recording, waited: Ints) -> None:
+    :param waited: see ``group_waits``.
+    :param begin: the span of the workers' time begins; ``end``: ends.
+    """
+
+    def __init__(self, recording: Recording, waited: Ints, begin: int, end: int) -> None:
         task_set = recording.task_set
         self._places = task_set.places()
         # by global vertex the index of its callback; the last entry is for undeclared ones
         self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
         self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)
+        self._duration = end - begin
         table = recording.executions
-        #: By worker how long it ran callbacks, ns.
-        self.by_worker: Counter[int] = Counter()
         for part, wait in zip(in_parts(table), in_parts(waited)):
             ran = (part['start'] >= 0) & (part['end'] >= 0)
             self._ran(pick(part, ran), wait[ran])
             self._completed(pick(part, ran & (part['completes'] != NOTHING) & (
                 part['vertex'] >= 0)))
-        self.pool = PoolUse(table['start'], table['end'])
+        #: How long workers ran declared callbacks, ns.
+        self.busy = sum(_busy(worker_spans(
+            recording, begin, end, table['vertex'] >= 0)).values())
+        spans = worker_spans(recording, begin, end)
+        #: By worker how long it ran callbacks, ns.
+        self.by_worker = _busy(spans)
+        self.pool = PoolUse(*in_one(spans), begin=begin)
+        lent = np.flatnonzero((table['worker'] < 0) & (table['start'] >= 0))
+        self._lent = int(np.maximum(0, np.minimum(table['end'][lent], end) - np.maximum(
+            table['start'][lent], begin)).sum())
 
     def _ran(self, table: Table, waited: Ints) -> None:
         vertex, start = table['vertex'], table['start']
         took, place = table['end'] - start, self._place[vertex]
-        for number in np.unique(table['worker']).tolist():
-            self.by_worker[number] += int(took[table['worker'] == number].sum())
         self._add('busy_ns', place, took)
         first, undeclared = table['piece'] == 0, vertex < 0
         self._add('executions', place[undeclared & first])
@@ -186,11 +233,6 @@ class Usage:
         """Update the longest times of callbacks by index."""
         np.maximum.at(self._table[NAMES.index(name)], places, times)
 
-    @property
-    def busy(self) -> int:
-        """Return the total time of declared callbacks, ns."""
-        return int(self._table[NAMES.index('busy_ns'), :-1].sum())
-
     def callbacks(self) -> dict[str, dict[str, int]]:
         """Return the usage of each declared callback, in file order."""
         return {key: self._result(place) for key, place in self._places.items()}
@@ -203,13 +245,24 @@ class Usage:
         column = self._table[:, place].tolist()
         return dict(zip(NAMES, column if column[_MEASURED] else column[:_MEASURED]))
 
-    def workers(self, count: int, duration: int) -> dict[str, Any]:
+    def workers(self, count: int) -> dict[str, Any]:
         """Return how busy the workers were; ``lent`` is the time of blocking calls."""
         return {
-            'busy_ns': {str(w): busy for w, busy in sorted(self.by_worker.items()) if w >= 0},
-            'lent_ns': sum(busy for w, busy in self.by_worker.items() if w < 0),
-            'use': share(sum(self.by_worker.values()), count, duration),
+            'busy_ns': {str(w): busy for w, busy in sorted(self.by_worker.items())},
+            'lent_ns': self._lent,
+            'use': share(sum(self.by_worker.values()), count, self._duration),
             'over_time': self.pool.result()}
+
+
+def in_one(spans: Mapping[int, tuple[Ints, Ints]]) -> tuple[Ints, Ints]:
+    """Return the starts and ends of all workers together."""
+    starts, ends = (np.concatenate([np.empty(0, dtype=np.int64), *each])
+                    for each in (zip(*spans.values()) if spans else ((), ())))
+    return starts, ends
+
+
+def _busy(spans: Mapping[int, tuple[Ints, Ints]]) -> dict[int, int]:
+    return {worker: int((ends - starts).sum()) for worker, (starts, ends) in spans.items()}
 
 
 def share(busy: int, workers: int, duration: int) -> float | None:

@@ -162,4 +162,6 @@ def _use(result: Mapping[str, Any]) -> str:
     use = result['worker_use']['use']
     if result['rescheduled']:
         return '' if use is None else f', workers busy {100 * use:.1f} %'
-    return f' (all callbacks: {ratio(use)})'
+    lent = result['worker_use']['lent_ns']
+    more = f'; {format_ns(lent, 3)} in callbacks that had lent their worker' if lent else ''
+    return f' (all callbacks: {ratio(use)}{more})'

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from mddag_executor.recording.tables import Ints, Recording
 from mddag_executor.replay.deadlines import Judged
-from mddag_executor.replay.usage import PoolUse, ran
+from mddag_executor.replay.usage import in_one, PoolUse, ran, worker_spans
 import numpy as np
 
 MOST_EXECUTIONS = 20_000
@@ -41,9 +41,8 @@ class Timeline:
     ) -> None:
         table = recording.executions
         rows = ran(table)
-        on_workers = rows[table['worker'][rows] >= 0]
         self.busy_over_time = PoolUse(
-            table['start'][on_workers], table['end'][on_workers], _FIRST_STEP)
+            *in_one(worker_spans(recording, recording.begin, recording.end)), _FIRST_STEP)
         missed = np.maximum(judged.missed['completed'], judged.missed['deadline'])
         self.missed_over_time = PoolUse(missed, missed + 1, _FIRST_STEP)
         self.n_executions, self.n_missed = len(rows), len(missed)

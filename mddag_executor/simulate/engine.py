@@ -33,6 +33,7 @@ from mddag_executor.core.state import (
     EXPIRED,
     fill_state,
     JUDGE_FROM,
+    JUDGE_UNTIL,
     State,
 )
 from mddag_executor.core.tables import NEVER, Tables
@@ -73,6 +74,7 @@ class Orders(NamedTuple):
     dispatch_overhead: int
     switch_overhead: int
     judge_from: int
+    judge_until: int
     cpus: int
     horizon: int
     stop_at_first_miss: int
@@ -159,7 +161,7 @@ def _fill(t: Tables, s: State, d: Deliveries, m: Machine, load: Load, o: Orders)
         o.switch_overhead, o.polling, o.urgency)
     if o.processes > 1:
         divide(s, [o.workers] * o.processes)
-    s.scalars[JUDGE_FROM] = o.judge_from
+    s.scalars[JUDGE_FROM], s.scalars[JUDGE_UNTIL] = o.judge_from, o.judge_until
     if sends:
         d.sent.append(0)
     if len(load.holds) > 0 or o.cpus < NEVER:

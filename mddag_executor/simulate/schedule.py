@@ -44,7 +44,7 @@ class Settings:
     :ivar dispatch_overhead_ns: added to an execution at each dispatch; ``switch_overhead_ns``: at
         each preemption.
     :ivar cpus: shared by the executions that compute; None: enough for all.
-    :ivar judge_from: jobs released before are not judged.
+    :ivar judge_from: jobs released before are not judged; ``judge_until``: nor those from then on.
     :ivar processes: number of processes, each with its own interpreter.
     :ivar on_late: handling of late jobs of a DAG that does not declare it.
     """
@@ -59,6 +59,7 @@ class Settings:
     switch_overhead_ns: int = 0
     cpus: int | None = None
     judge_from: int = -NEVER
+    judge_until: int = NEVER
     processes: int = 1
     on_late: str = 'continue'
 
@@ -74,7 +75,8 @@ class Settings:
             self.workers, self.processes, int(self.preempts),
             int(find_policy(self.policy).polling), find_policy(self.policy).urgency,
             self.dispatch_overhead_ns,
-            self.switch_overhead_ns, self.judge_from, self.cpus or NEVER, self.duration_ns,
+            self.switch_overhead_ns, self.judge_from, self.judge_until, self.cpus or NEVER,
+            self.duration_ns,
             int(self.stop_at_first_miss), int(self.judge == 'horizon'), 1)
 
 
@@ -103,7 +105,7 @@ class Scheduled(NamedTuple):
             return
         for time, dag, release in zip(*map(as_list, (load.times, load.dags, releases))):
             if (time <= self.ended and time < settings.duration_ns
-                    and release >= settings.judge_from):
+                    and settings.judge_from <= release < settings.judge_until):
                 tally.released(dag)
         tally.add(self.decisions)
 
@@ -114,7 +116,8 @@ class Scheduled(NamedTuple):
         import numpy as np
         times, dags, released = map(np.asarray, (load.times, load.dags, releases))
         judged = (times <= self.ended) & (times < settings.duration_ns) & (
-            released >= settings.judge_from) & (dags < len(tally.jobs))
+            released >= settings.judge_from) & (released < settings.judge_until) & (
+            dags < len(tally.jobs))
         tally.jobs = np.bincount(
             dags[judged].astype(np.int64), minlength=len(tally.jobs)).tolist()
         decisions = np.asarray(self.decisions, dtype=np.int64).reshape(-1, 6)

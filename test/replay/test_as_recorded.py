@@ -250,6 +250,26 @@ def test_a_run_killed_in_its_first_callback_which_had_published(trace):
     assert outcome.result()['dags']['/camera']['jobs'] == 1
 
 
+def test_a_worker_is_busy_at_most_all_of_the_time(tmp_path, call):
+    """In a part, executions reach out of it; a callback in a blocking call has no worker."""
+    trace = Written(tmp_path / 'a.mcap', ONE)
+    for job in range(3):
+        at = 10 * job
+        trace.release(0, job, at)
+        trace.run(0, 0, job, at, at + 9)
+        trace.piece(-1, -1, -1, at, at + 8, worker=-1, thread=9)
+    path = trace.end(30)
+    whole, part = (replay(path, span=span).result() for span in (None, (4 * MS, 6 * MS)))
+    assert (whole['utilisation'], part['utilisation']) == (0.9, 1.0)
+    for result, busy, lent in ((whole, 27, 24), (part, 2, 2)):
+        use = result['worker_use']
+        assert use['use'] == result['utilisation']
+        assert (use['busy_ns'], use['lent_ns']) == ({'0': busy * MS}, lent * MS)
+        assert sum(use['over_time']['busy_ns']) == busy * MS
+    assert ('(all callbacks: 0.900; 24 ms in callbacks that had lent their worker)'
+            in call('replay', path).stdout)
+
+
 def test_misses_that_are_not_those_recorded_are_said(trace):
     job_of_the_camera(trace, 0, 10)
     trace.add('deadline', 26, 0, 4, 0, START_TIME + 24 * MS, START_TIME + 25 * MS)

@@ -11,8 +11,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DROP, JOB_END
+from mddag_executor.core.tally import total
 from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, WITHDRAWN
-from mddag_executor.replay import open_recording, Replay, ReplayError
+from mddag_executor.replay import open_recording, Replay, ReplayError, reschedule
 from mddag_executor.replay.deadlines import Judged
 from msg_graph import loads
 import numpy as np
@@ -194,6 +195,16 @@ def test_a_bag_and_its_parts():
             recording.cut(begin, end)
     with pytest.raises(ReplayError, match='it ends 1.4.. s after its first release'):
         recording.cut(10 ** 12, 2 ** 62)
+
+
+def test_a_part_that_is_rescheduled_has_the_results_of_the_part():
+    part = open_recording(DEMO).cut(500 * MS, 600 * MS)
+    before, after = Replay(part), reschedule(part)
+    assert [sum(each.tally.jobs) for each in (before, after)] == [20, 20]
+    assert total(after.result()['dags']).due == total(before.result()['dags']).due == 37
+    computed = Replay(after.computed().recording(7))
+    assert computed.tally.result()['dags'] == after.tally.result()['dags']
+    assert 0 < after.result()['worker_use']['use'] < 1
 
 
 def test_a_recording_in_a_program(tmp_path):
