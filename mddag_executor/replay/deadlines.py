@@ -8,7 +8,8 @@ Theory of operation
 The rules are rules 1, 2, 6, 8 and 10 of the scheduler core (``core.rules``), applied to all jobs
 at once; ``test/replay/test_deadlines.py`` compares both implementations.
 
-1. A vertex completes when the last of its legs completes.
+1. A vertex completes when the last of its legs completes; in an imported recording, with the
+   execution that is marked as the last one of the job (``imported_jobs``).
 2. A job ends when all its sinks have completed, or earlier if it is recorded as expired, aborted
    or failed.  Later completions do not count.
 3. A sink that completed by its absolute deadline is in time, later it is late.  If the job ended
@@ -126,7 +127,8 @@ class Judged:
         ends, releases = (
             [pick(table, mine) for mine in rows_by(table['dag'], len(task_set.dags))]
             for table in (recording.job_ends, recording.releases))
-        completions = _completions(recording.executions, len(task_set.dags))
+        completions = _completions(
+            recording.executions, len(task_set.dags), recording.links)
         self.jobs: list[Jobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
@@ -291,7 +293,7 @@ class Judged:
             row, order, vertex, completing = (
                 each[known] for each in (row, order, vertex, completing))
         n_legs = np.array(self.tables.n_legs[first:first + jobs.done.shape[1]])
-        single = n_legs[vertex] == 1
+        single = (n_legs[vertex] == 1) | self._recording.links
         # the first completion of each vertex wins: it is written last
         places, orders = jobs.done.reshape(-1), position.reshape(-1)
         cell = row * jobs.done.shape[1] + vertex
@@ -410,12 +412,14 @@ def _verdicts(
         row=row, order=order)
 
 
-def _completions(executions: Table, n_dags: int) -> list[list[Table]]:
-    """Return by DAG the completions of vertices, in parts."""
+def _completions(executions: Table, n_dags: int, whole: bool) -> list[list[Table]]:
+    """Return by DAG the completions of vertices, in parts; ``whole``: not those of legs."""
     found = [[np.empty(0, dtype=_COMPLETIONS)] for _ in range(n_dags)]
     begin = 0
     for part in in_parts(executions):
-        which = np.flatnonzero((part['completes'] != recorded.NOTHING) & (part['vertex'] >= 0))
+        completes = part['completes']
+        done = completes == recorded.VERTEX if whole else completes != recorded.NOTHING
+        which = np.flatnonzero(done & (part['vertex'] >= 0))
         table = recorded.rows(_COMPLETIONS, len(which), row=begin + which, **{
             name: part[name][which] for name in ('vertex', 'order', 'job')})
         for parts, mine in zip(found, rows_by(part['dag'][which], n_dags)):

@@ -55,6 +55,8 @@ OWN_KINDS: dict[str, tuple[Any, ...]] = {
     'mddag:dispatch': (READY, 'callback', 'ready'), 'mddag:shutdown': (SHUTDOWN, 'end')}
 """The same of this executor's own events, for a trace without declaration."""
 
+_INIT_TIME = 'init_timestamp'
+"""The field of a timer's initialisation that is a time."""
 _EVENT = np.dtype([('time', 'i8'), ('place', 'i8'), ('thread', 'i8'), ('kind', 'i1'),
                    ('a', 'i8'), ('b', 'i8'), ('c', 'i8')])
 
@@ -73,6 +75,27 @@ class Events(NamedTuple):
     threads: list[tuple[int, int]]
     others: list[Event]
     warning: str
+
+
+def moved(events: Events, shift: Mapping[int, int]) -> Events:
+    """
+    Return events with the times of some processes moved.
+
+    :param shift: by process id what is added, ns.  Source timestamps in events do not change.
+    """
+    table = events.table.copy()
+    table['time'] += np.array(
+        [shift.get(pid, 0) for pid, _ in events.threads], dtype=np.int64)[table['thread']]
+    table['time'] = np.clip(table['time'], 0, NEVER - 1)
+    others = []
+    for layout, time, pid, *rest in events.others:
+        more = shift.get(pid, 0)
+        if _INIT_TIME in layout.fields:
+            rest[1 + layout.fields.index(_INIT_TIME)] += more
+        others.append((layout, min(max(0, time + more), NEVER - 1), pid, *rest))
+    return events._replace(
+        table=table[sort_by(table['time'], table['place'])],
+        others=sorted(others, key=lambda event: event[1]))
 
 
 def read_events(

@@ -21,6 +21,12 @@ Events are named by their position in the order of time.
      publication is not, this only affects jobs without a recorded publication with source
      timestamp to this callback;
    * the tracer discarded events.
+
+   It is also withdrawn if a callback of one of its uncompleted vertices ever ran for a message
+   between computers whose clocks differ by an unknown time (`imported_clocks`).
+4. *Several messages of an execution.*  If an execution publishes a topic several times, the
+   callbacks after it run several times in the job.  A vertex completes with the last of them; the
+   earlier ones count like messages of a sync that are only stored (`LEG`).
 """
 
 from __future__ import annotations
@@ -61,13 +67,15 @@ class ImportedJobs:
 
     :param targets: by callback of ``links`` its declared callback, if any.
     :param first: by run of a callback the first run of its execution.
+    :param distrusted: by run of a callback whether the clock of its sender is unknown.
     :ivar sources: the executions of sources, one for each row of ``releases``.
     :ivar releases: the jobs; ``ends``: the expired and withdrawn ones.
     """
 
     def __init__(self, task_set: TaskSet, links: Links, targets: Sequence[Target | None],
-                 first: Ints) -> None:
+                 first: Ints, distrusted: Mask) -> None:
         self._dags, self._links, self._first = task_set.dags, links, first
+        self._distrusted = distrusted
         self._tables = Tables.build(task_set, legs=True)
         #: A vertex of each declared callback; and by callback of ``links``, if it is declared.
         self._vertices = {v.callback.key: each for each, v in enumerate(task_set.vertices)}
@@ -114,9 +122,11 @@ class ImportedJobs:
         here, callback = np.arange(len(runs)), runs['callback']
         mine = (self._declared[callback] >= 0) & (self._source[callback] < 0) & (
             self._first == here)
+        # no message is received before it was published: clocks differ, or times are damaged
+        self._distrusted = self._distrusted | (sender >= here)
         #: Executions of an unknown job.
-        self._unknown = np.flatnonzero(mine & (sender < 0))
-        todo = np.flatnonzero(mine & (sender >= 0) & (sender < here))
+        self._unknown = np.flatnonzero(mine & ((sender < 0) | self._distrusted))
+        todo = np.flatnonzero(mine & (sender >= 0) & ~self._distrusted)
         while len(todo):
             cause = self._first[sender[todo]]
             vertex = self._after[self._vertex[cause], callback[todo]]
@@ -146,7 +156,11 @@ class ImportedJobs:
             table[name][known] = self.releases[name][self._row[known]]
         done = np.flatnonzero(known & last)
         done = done[sort_by(runs['end_at'][done])]
-        table['completes'][done] = np.where(self._whole(done), VERTEX, LEG)
+        whole = self._whole(done)
+        cell = self._row[done[whole]] * len(self._after) + self._vertex[done[whole]]
+        _, last_of = np.unique(cell[::-1], return_index=True)
+        table['completes'][done] = LEG
+        table['completes'][done[whole][::-1][last_of]] = VERTEX     # rule 4
         closed = self._closed()
         position = np.append(runs['at'][self.sources], _NEVER)
         self.ends, ends = self._find_ends(
@@ -202,7 +216,8 @@ class ImportedJobs:
         :param done: executions that completed vertices, in the order of their ends.
         """
         open_ones, withdrawn = np.zeros((2, len(closed)), dtype=np.bool_)
-        doubts = _Doubts(self._links, self._declared, self._row, self._unknown)
+        doubts = _Doubts(
+            self._links, self._declared, self._row, self._unknown, self._distrusted)
         dags, release, job = (self.releases[name] for name in ('dag', 'release', 'job'))
         until = position[closed]
         row, at = self._row[done], self._links.runs['end_at'][done]
@@ -232,16 +247,23 @@ class _Doubts:
     :param declared: by callback a vertex of its declared callback.
     :param row: by run of a callback the row of its job.
     :param unknown: executions for an unknown job.
+    :param distrusted: by run of a callback whether the clock of its sender is unknown.
     """
 
-    def __init__(self, links: Links, declared: Ints, row: Ints, unknown: Ints) -> None:
+    def __init__(
+        self, links: Links, declared: Ints, row: Ints, unknown: Ints, distrusted: Mask
+    ) -> None:
         runs, messages = links.runs[unknown], links.messages
         at, callback, _, time = links.lost.T
         self._of = np.append(np.append(declared, _ANY)[callback], declared[runs['callback']])
         #: Whether a publication is missing, but its message's source timestamp is known.
+        distrusted = distrusted[unknown]
         self._unsent = np.append(
-            np.zeros(len(at), np.bool_), (runs['message'] >= 0) | (runs['stamp'] != 0))
-        self._at, self._time = np.append(at, runs['at']), np.append(time, runs['start'])
+            np.zeros(len(at), np.bool_),
+            ((runs['message'] >= 0) | (runs['stamp'] != 0)) & ~distrusted)
+        # by an unknown clock, the callback may have run in any job
+        self._at = np.append(at, np.where(distrusted, -1, runs['at']))
+        self._time = np.append(time, np.where(distrusted, _NEVER, runs['start']))
         # the publications of jobs
         self._topics = links.topics
         job = np.append(row, UNKNOWN)[messages['run']]

@@ -46,12 +46,14 @@ from mddag_executor.recording.tables import (
     TAKES,
     UNKNOWN,
 )
-from mddag_executor.replay.imported_events import KINDS, read_events, START
+from mddag_executor.replay.imported_clocks import ImportedClocks
+from mddag_executor.replay.imported_events import KINDS, moved, read_events, START
 from mddag_executor.replay.imported_jobs import ImportedJobs
 from mddag_executor.replay.links import Links, Losses
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed
+from mddag_executor.trace.events import Event
 from mddag_executor.trace.times import credible
 from msg_graph import TaskSet
 import numpy as np
@@ -89,16 +91,18 @@ class ImportedRun:
             self._events = read_events(
                 reader, self.kinds, self.others, progress)
         give_back()     # memory of the batches
-        table = self._events.table
-        starts = table[table['kind'] == START]
+        starts = self._starts()
         init = [event for event in self._events.others if event[0].name not in _OWN]
         # this executor recorded it, but its executions are lost
         own = len(init) < len(self._events.others)
         if head is None and (own or not len(starts)):
             raise no_run(reader)
-        #: The nodes and callbacks.
-        self.who = Entities()
-        self.who.read(init)
+        self._link(init)
+        self._clocks = ImportedClocks(self.links)
+        if self._clocks.shift:
+            self._events = moved(self._events, self._clocks.shift)
+            self._link([event for event in self._events.others if event[0].name not in _OWN])
+            starts = self._starts()
         threads = {self._events.threads[each] for each in np.unique(starts['thread']).tolist()}
         # The policy of another executor is not recorded; its name replaces the pool.
         self.head = head or Head(
@@ -112,17 +116,29 @@ class ImportedRun:
         self._vertex = {number: vertices[target.callback.key]
                         for number, target in self._targets.items()}
         #: The last event's time, ns.
-        self.end = max(min(max(0, self.head.time), NEVER - 1), int(table['time'].max(initial=0)))
-        self.links = self.links_type(self._events, self.who)
+        self.end = max(min(max(0, self.head.time), NEVER - 1),
+                       int(self._events.table['time'].max(initial=0)))
         self._odd = Losses(_OFF_THE_GRID, 5)
         self._fallbacks: Counter[str] = Counter()
+
+    def _starts(self) -> Table:
+        table = self._events.table
+        starts: Table = table[table['kind'] == START]
+        return starts
+
+    def _link(self, init: Sequence[Event]) -> None:
+        """Link executions and messages."""
+        #: The nodes and callbacks.
+        self.who = Entities()
+        self.who.read(init)
+        self.links = self.links_type(self._events, self.who)
 
     def read(self) -> Recording:
         """Return the recording."""
         links, table = self.links, self._executions()
         targets = [self._targets.get(each.number) for each in links.callbacks]
         first, last = self._pieces()
-        jobs = ImportedJobs(self.task_set, links, targets, first)
+        jobs = ImportedJobs(self.task_set, links, targets, first, self._clocks.distrusted)
         table['ready'], release = self._times(jobs)
         jobs.fill(table, release, last)
         found = Recording(
@@ -198,15 +214,31 @@ class ImportedRun:
     def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
         """Return by execution when it was ready, and by source execution its release."""
         runs, messages, start = self.links.runs, self.links.messages, self.links.runs['start']
-        sent = np.where(credible(runs['stamp'], start), runs['stamp'], 0)
+        sent = self._stamps('stamp')
         if len(messages):
             message = messages[runs['message']]
-            published = np.where(message['stamp'] != 0, message['stamp'], message['time'])
+            published = np.where(
+                message['stamp'] != 0, message['stamp'] + self._of_sender, message['time'])
             sent = np.where((sent == 0) & (runs['message'] >= 0), published, sent)
         ready = np.minimum(np.where(sent != 0, sent, _arrival(runs)), start)
         timers = np.flatnonzero(self._is_any('timer')[runs['callback']])
         ready[timers] = self._due(timers, start[timers])
         return ready, self._releases(jobs, ready, 'timer')
+
+    @property
+    def _of_sender(self) -> Ints:
+        """Return by execution how the clock of the sender of its message was moved, ns."""
+        at = self.links.messages['at']
+        shift = self._clocks.shifts[self._events.table['thread'][at]]
+        found: Ints = np.append(shift, 0)[self.links.runs['message']]
+        return found
+
+    def _stamps(self, name: str) -> Ints:
+        """Return the stamps of messages by execution, on the recording's clock; 0: unknown."""
+        runs = self.links.runs
+        known = credible(runs[name], runs['start'])
+        found: Ints = np.where(known, runs[name] + self._of_sender, 0)
+        return found
 
     def _is_any(self, *kinds: str) -> Mask:
         """Return by callback whether it is of one of the kinds."""
@@ -218,13 +250,15 @@ class ImportedRun:
 
         :param by_ready: kinds of callbacks that are released when they are ready.
         """
+        stamps, stated_stamps = (
+            self._stamps(name)[jobs.sources] for name in ('stamp', 'stated'))
         runs = self.links.runs[jobs.sources]
         start, number = runs['start'], runs['callback']
         wanted = np.array([dag.release_from for dag in self.task_set.dags])[jobs.releases['dag']]
         by_header, by_stamp = wanted == 'header_stamp', wanted != 'arrival'
-        known, stated = credible(runs['stamp'], start), credible(runs['stated'], start)
-        stamp = np.where(by_stamp & known, runs['stamp'], _arrival(runs))
-        stamp = np.minimum(np.where(by_header & stated, runs['stated'], stamp), start)
+        known, stated = stamps != 0, stated_stamps != 0
+        stamp = np.where(by_stamp & known, stamps, _arrival(runs))
+        stamp = np.minimum(np.where(by_header & stated, stated_stamps, stamp), start)
         other = self._is_any(*by_ready)[number]
         release: Ints = np.where(other, ready[jobs.sources], stamp)
         ready[jobs.sources] = np.maximum(ready[jobs.sources], release)
@@ -271,6 +305,7 @@ class ImportedRun:
             lines.append(
                 f'{name}: the tracer discarded {counted(found.lost, "event")} or more: '
                 'executions and messages may be missing')
+        lines += [f'{name}: {text}' for text in self._clocks.lines()]
         lines += [f'{name}: {text}' for text in self.links.losses.lines()]
         unjudged = found.unjudged
         if unjudged:

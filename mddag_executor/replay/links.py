@@ -157,11 +157,13 @@ class Links:
         unknown), ``run`` (-1: none), ``time``, ``stamp``, ``within`` (only within the process).
     :ivar topics: numbers of topics by name; ``topic_of``: by message the number of its topic.
     :ivar takes: executions with messages that they took themselves.
+    :ivar threads: process and thread id, by index.
     :ivar lost: signs of missing events, in the order of time: the fields of ``Lost``.
     """
 
     def __init__(self, events: Events, who: Entities) -> None:
         self.events, self.who, self.losses = events.table, who, Losses(_SAID, 3)
+        self.threads = events.threads
         self._pid = np.array([pid for pid, _ in events.threads], dtype=np.int64)
         kind = self.events['kind']
         self.discarded = int(self.events['a'][kind == LOST].sum())

@@ -6,7 +6,7 @@ from mddag_executor.replay import replay, ReplayError, reschedule
 from msg_graph import loads
 import pytest
 
-from .recorded import BEGIN, MS, Recorded, US
+from .recorded import BEGIN, CAMERA, MS, Recorded, US
 
 GRAB, DETECT, FUSE_BOXES, FUSE_IMU, IMU, PLAN = 11, 12, 13, 14, 15, 16
 IMAGE, BOXES, IMU_OUT, PATH = 100, 101, 102, 103
@@ -215,6 +215,88 @@ def test_late_and_off_the_grid(tmp_path):
         'initialisation in it): released when it started: /n timer 10ms (1)',
         '2 periods of timers passed without an execution (late by more than one, or events were '
         'lost): without a job: /n timer 10ms (2)']
+
+
+def two_computers(path, skew=0, back=False, ways=2 * MS):
+    """Write a camera, and on another computer, whose clock is behind, what detects and plans."""
+    r = Recorded(path)
+    r.node(1, '/camera')
+    r.node(2, '/detect', pid=2)
+    r.timer(GRAB, 1, 100 * MS)
+    r.publisher(IMAGE, 1, '/image')
+    r.subscription(DETECT, 2, '/image', time=-skew, pid=2)
+    r.publisher(BOXES, 2, '/boxes', time=-skew, pid=2)
+    r.subscription(PLAN, 1, '/boxes')
+    for k in range(1, 11):
+        at = k * 100 * MS
+        r.run(GRAB, 1, at, at + 2 * MS)
+        image = r.publish(IMAGE, 1, at + MS)
+        r.receive(DETECT, 2, at + MS + ways - skew, at + MS + ways + 4 * MS - skew, image, pid=2)
+        if back:
+            boxes = r.publish(BOXES, 2, at + 5 * MS - skew, pid=2)
+            r.receive(PLAN, 1, at + 5 * MS + ways, at + 5 * MS + ways + MS, boxes)
+    return r.write()
+
+
+TWO = """\
+mddag: 1
+nodes:
+  - {node: /camera, callbacks: [{name: grab, timer: 100ms, publishes: [/image]},
+                                {name: plan, subscription: /boxes, deadline: 10ms}]}
+  - {node: /detect, callbacks: [{name: run, subscription: /image, publishes: [/boxes]}]}
+"""
+
+
+@pytest.mark.parametrize('skew', [5 * MS, -5 * MS, 40_000 * MS])
+def test_messages_both_ways_show_how_clocks_of_two_computers_differ(tmp_path, skew):
+    graph = loads(TWO, 'graph.yaml')
+    sound, nothing = result_of(two_computers(tmp_path / 'one.mcap', 0, back=True), graph)
+    result, warnings = result_of(two_computers(tmp_path / 'two.mcap', skew, back=True), graph)
+    said, = (line for line in warnings if 'clock' in line)
+    assert not [line for line in nothing if 'clock' in line]
+    ahead = f'{abs(skew) / 1e6:.3f} ms {"behind" if skew > 0 else "ahead of"}'
+    assert said == (f'the clock of /detect is taken to be {ahead} that of /camera, within '
+                    '1.996 ms, by the messages both ways')
+    for key in ('dags', 'communications', 'callbacks', 'duration_ns'):
+        assert result[key] == sound[key], key
+    assert result['dags']['/camera']['sinks']['/camera:plan']['completed'] == 10
+
+
+@pytest.mark.parametrize('skew', [3 * MS, 5 * MS, 400 * MS])
+def test_nothing_is_judged_by_two_clocks_that_differ_by_an_unknown_time(tmp_path, skew):
+    graph = loads(CAMERA, 'graph.yaml')
+    result, warnings = result_of(two_computers(tmp_path / 'two.mcap', skew), graph)
+    camera = result['dags']['/camera']
+    assert (camera['unjudged'], camera['jobs']) == (10, 10)
+    assert set(camera['ends'].values()) == {0}
+    sink, = camera['sinks'].values()
+    assert (sink['completed'], sink['late'], sink['expired'], sink['overdue']) == (0, 0, 0, 0)
+    said, = (line for line in warnings if 'clocks of computers differ' in line)
+    assert f'from /camera to /detect arrive up to {(skew - 2 * MS) / 1e6 + 0.004:.3f} ms' in said
+
+
+def test_an_execution_that_publishes_twice_is_judged_by_the_last_answer(tmp_path, call):
+    r = Recorded(tmp_path / 'twice.mcap')
+    r.node(1, '/camera')
+    r.node(2, '/detect')
+    r.timer(GRAB, 1, 100 * MS)
+    r.publisher(IMAGE, 1, '/image')
+    r.subscription(DETECT, 2, '/image')
+    for k in range(1, 6):
+        at = k * 100 * MS
+        r.run(GRAB, 1, at, at + 3 * MS)
+        first, second = (r.publish(IMAGE, 1, at + each * MS) for each in (1, 2))
+        r.receive(DETECT, 2, at + 4 * MS, at + 6 * MS, first)
+        r.receive(DETECT, 2, at + 7 * MS, at + (30 if k == 3 else 9) * MS, second)
+    graph = tmp_path / 'graph.yaml'
+    graph.write_text(CAMERA)
+    result = call('replay', r.write(), graph, '--json', '-').result
+    assert result['warnings'] == []
+    sink, = result['dags']['/camera']['sinks'].values()
+    assert (sink['completed'], sink['late'], sink['response_ns']['max']) == (5, 1, 30 * MS)
+    assert result['callbacks']['/detect:run']['executions'] == 10
+    again = call('replay', r.path, graph, '--reschedule', '--json', '-').result
+    assert again['dags']['/camera']['sinks']['/detect:run']['late'] == 1
 
 
 SOURCE = """\
