@@ -99,7 +99,7 @@ class Announcements:
         # until when (trace's clock) each message waits, and its info from the middleware
         self._waiting: list[tuple[int, Work, dict[str, Any]]] = []
         self._checked_at = 0
-        # the time that may be spent on announcements, and when it was last updated, ns
+        # the CPU time that may be spent on announcements, and when it was last updated, ns
         self._allowance = SAVED_NS
         self._allowed_at = time.monotonic_ns()
         self._warn_at = 0
@@ -107,7 +107,7 @@ class Announcements:
         names = [each.name for each in task_set.processes]
         own = names.index(process)
         self.node = quiet_node(
-            f'_mddag_jobs_{os.getpid()}_{own}', pool.executor.context, is_remapped=True)
+            f'_mddag_jobs_{os.getpid()}_{own}', pool.context, is_remapped=True)
         self._n_others = len(names) - 1
         self._publisher: Publisher | None = self.node.create_publisher(
             UInt8MultiArray, f'/mddag/jobs_{digest}/p{own}', _QOS)
@@ -173,6 +173,7 @@ class Announcements:
         size, rest = divmod(len(message.data), _ENTRY.size)
         if rest or size > MOST_ENTRIES or not self._may_hear():
             return
+        begin = time.thread_time_ns()
         for entry in _ENTRY.iter_unpack(message.data):
             if self._is_plausible(*entry[-4:]):
                 self._note(*entry)
@@ -181,7 +182,7 @@ class Announcements:
             if origin is not None:
                 self._waiting.remove(entry)
                 self._give(entry[1], origin)
-        self._allowance -= time.monotonic_ns() - self._allowed_at
+        self._allowance -= time.thread_time_ns() - begin
 
     def _may_hear(self) -> bool:
         """Return whether announcements have taken no more than their share of the time."""

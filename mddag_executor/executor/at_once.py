@@ -55,8 +55,11 @@ class AtOnce:
             with self.pool.lock:
                 fired = list(self.timers.fire())
             for work, *_ in fired:
-                work.function(*work.args)
-                self.count(work.entity)
+                if compat.ends_sleep(work.function):
+                    work.function(*work.args)
+                    self.count(work.entity)
+                else:  # it had no callback at first, and is not that of a Rate
+                    self.pool.post([work])
         due = self.timers.next_due()
         if due != self.loop.timer.at:
             self.loop.timer.arm(due)

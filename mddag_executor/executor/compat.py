@@ -180,14 +180,21 @@ def attach_futures(waitable: Any, executor: Any) -> None:
         future._set_executor(executor)
 
 
+_FORGET = rclpy.client.Client.remove_pending_request.__code__
 _UNBLOCK = next(
     (each for each in rclpy.client.Client.call.__code__.co_consts
      if getattr(each, 'co_name', '') == 'unblock'), None)
 
 
-def ends_call(callback: Any) -> bool:
-    """Return whether it is the done callback by which ``Client.call`` stops waiting."""
-    return _UNBLOCK is not None and getattr(callback, '__code__', None) is _UNBLOCK
+def is_quick(callback: Any) -> bool:
+    """
+    Return whether it is a done callback of rclpy itself that takes no time and never fails.
+
+    These are the one by which ``Client.call`` stops waiting, and the one by which a client forgets
+    a request that is answered or cancelled.
+    """
+    code = getattr(getattr(callback, '__func__', callback), '__code__', None)
+    return code is _FORGET or code is not None and code is _UNBLOCK
 
 
 _NUMBERS = {

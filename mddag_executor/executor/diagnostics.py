@@ -244,7 +244,7 @@ class Diagnostics:
         recorder: Recorder | None, period_ns: int, thresholds: Thresholds, process: str | None,
         notifier: MissNotifier | None,
     ) -> None:
-        self._context = pool.executor.context
+        self._context = pool.context
         self._registry = registry
         self._period_ns = period_ns
         self._hardware_id = f'{socket.gethostname()}/{process or os.getpid()}'
@@ -272,9 +272,9 @@ class Diagnostics:
         """Begin to publish; further calls do nothing."""
         if self._thread is None:
             stop_at_exit(self)
-            self._thread = threading.Thread(
-                target=self._run, name='mddag-diagnostics', daemon=True)
-            self._thread.start()
+            thread = threading.Thread(target=self._run, name='mddag-diagnostics', daemon=True)
+            thread.start()  # may fail
+            self._thread = thread
 
     def stop(self) -> None:
         """Stop publishing; does nothing if it has not begun."""

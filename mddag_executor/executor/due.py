@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from heapq import heappop, heappush
-import os
 from time import monotonic_ns, process_time_ns
 from typing import TYPE_CHECKING
 
@@ -85,8 +84,8 @@ class DueTimes:
         self._notice_stop(monotonic, since)
         if monotonic > self._check_context_at:  # a context that was only destroyed is not reported
             self._check_context_at = monotonic + 20 * AGAIN_NS
-            if is_over(pool.executor.context):
-                pool.executor.wake()
+            if is_over(pool.context):
+                pool.wake_executor()
         self._timer.at = NEVER
         pool.fire_timers()
         if now > self._engine.deadlines.next:
@@ -230,13 +229,8 @@ class Guard(ChannelSource):
 
     def close(self) -> None:
         """Close the descriptor, once."""
-        fd, self.fd, self._timer.fd = self.fd, -1, -1
-        if fd >= 0:
-            os.close(fd)
-
-    def __del__(self) -> None:
-        """Close the descriptor of an executor that was never shut down."""
-        self.close()
+        self.fd = -1
+        self._timer.close()
 
 
 class Muting:

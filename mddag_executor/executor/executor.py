@@ -34,15 +34,17 @@ from mddag_executor.executor.announcements import Announcements
 from mddag_executor.executor.at_once import AtOnce, SignalPipe
 from mddag_executor.executor.compat import (
     BareExecutor,
-    ends_call,
     is_called_by_spin,
+    is_quick,
     RCL_ERRORS,
     TASKS_NEWEST_FIRST,
 )
 from mddag_executor.executor.diagnostics import Diagnostics
+from mddag_executor.executor.ending import Ending, weakly
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.gil import short_switch_interval
+from mddag_executor.executor.loop import raise_limit
 from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.name_check import NameCheck
 from mddag_executor.executor.recorder import Recorder
@@ -127,6 +129,9 @@ class MultiDeadlineExecutor(BareExecutor):
     :raises rclpy.exceptions.NotInitializedException: when ``rclpy.init`` was not called before.
     """
 
+    _ending: Any = None
+    _must_shut_down = False
+
     def __init__(
         self,
         graph: str | os.PathLike[str] | TaskSet | None = None,
@@ -163,32 +168,47 @@ class MultiDeadlineExecutor(BareExecutor):
         settings.check_process(process, task_set)
         # All parameters are checked by now: an error leaves no trace and no thread behind.
         publishing.install()
+        raise_limit()
+        fail = weakly(self._fail)
         self._trace_clock = TraceClock()
         self._recorder = None if trace is None else Recorder(
             os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs,
             self._trace_clock, overwrite=overwrite, on_late=on_late)
         self._errors: deque[BaseException] = deque()
         self._process = process
-        self._unclaimed = Unclaimed(self._fail, lambda: self._at_once.ring())
         self._spinning = threading.Lock()
-        self._finished = False
         self._ended_by_callback = False
-        # reentrant: a signal handler may end the run in the thread that is ending it
-        self._ending = threading.RLock()
         self._freeze_gc = freeze_gc
         self._notifier = None if on_deadline_miss is None else MissNotifier(
-            on_deadline_miss, self._fail)
+            on_deadline_miss, fail)
         self._engine = Engine(
             task_set, num_workers, policy, default_deadline=deadline_ns,
             max_active_jobs=max_active_jobs, expire_after=EXPIRE_AFTER_NS,
             on_late=on_late, record=self._recorder.record if self._recorder else None,
             on_miss=None if self._notifier is None else self._notifier.post, process=process)
-        self._pool = WorkerPool(
-            self._engine, self._trace_clock, self, self._fail, prepare)
-        self._at_once = AtOnce(self._pool)
-        self._at_once.loop.add_own(self._pool.guard)
-        self._signals = SignalPipe()
-        self._at_once.loop.add_own(self._signals)
+        try:
+            self._pool = WorkerPool(self._engine, self._trace_clock, fail, prepare)
+            self._at_once = AtOnce(self._pool)
+            self._at_once.loop.add_own(self._pool.guard)
+            self._signals = SignalPipe()
+            self._at_once.loop.add_own(self._signals)
+            self._unclaimed = Unclaimed(fail, self._at_once.ring)
+            self._ending = Ending(
+                self._pool, self._at_once, self._signals, self._recorder, self._notifier)
+            self._complete(context, task_set, every_ns, thresholds or Thresholds())
+        except BaseException:  # too many open files, or the context has ended
+            if self._ending is not None:
+                self._ending.undo()
+            if self._recorder is not None:
+                self._recorder.close(self._trace_clock.now())
+            raise
+
+    def _complete(
+        self, context: Context | None, task_set: TaskSet | None, every_ns: int | None,
+        thresholds: Thresholds,
+    ) -> None:
+        """Make the parts that need the context."""
+        process = self._process
         self._registry = Registry(task_set, self._engine, self._pool.leave_group)
         self._new_tasks: deque[Work] = deque()
         self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
@@ -197,21 +217,23 @@ class MultiDeadlineExecutor(BareExecutor):
         self._names = NameCheck(task_set, self._registry, process)
         self._announcements: Announcements | None = None
         self._check_at: list[float] = []  # when to check again whether the context has ended
-        self._stepping: select.epoll | None = None
         super().__init__(context=context)
-        self._wait_sets = WaitSetThread(self._pool, self._signalled)
-        self._upkeep = Upkeep(
-            self._nodes_to_serve, self._registry, self._pool, self._at_once, self._recorder,
-            self._wait_sets)
+        self._pool.attach(self)
+        self._wait_sets = self._ending.wait_sets = WaitSetThread(
+            self._pool, self.signal_guard(), weakly(self._signalled))
+        self._upkeep = self._ending.upkeep = Upkeep(
+            weakly(self._nodes_to_serve), self._registry, self._pool, self._at_once,
+            self._recorder, self._wait_sets)
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
-            self._diagnostics = Diagnostics(
+            self._diagnostics = self._ending.diagnostics = Diagnostics(
                 task_set, self._pool, self._registry, self._recorder, every_ns,
-                thresholds or Thresholds(), process, self._notifier)
+                thresholds, process, self._notifier)
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
-            self._announcements = Announcements(task_set, process, self._pool)
+            self._announcements = self._ending.announcements = Announcements(
+                task_set, process, self._pool)
             self._pool.announcements = self._announcements
             self._registry.own = {*self._announcements.subscriptions}
         # Otherwise ready callbacks would run before the spin notices.
@@ -231,6 +253,11 @@ class MultiDeadlineExecutor(BareExecutor):
         self._ended_by_callback = is_ours or (
             self._notifier is not None and self._notifier.is_calling())
         self.wake()
+        if self._spinning.acquire(blocking=False):  # else the spin ends, and does the rest
+            try:
+                self._ending.abandon()
+            finally:
+                self._spinning.release()
 
     # --- nodes -----------------------------------------------------------------------------------
 
@@ -284,7 +311,7 @@ class MultiDeadlineExecutor(BareExecutor):
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Run a function or coroutine in this executor; return its task, which is a future."""
         # A callback that ends a Client.call needs no worker: all workers may wait in such calls.
-        if type(callback) is QuickCallback or ends_call(callback):
+        if type(callback) is QuickCallback or is_quick(callback):
             task = Task(callback, args, kwargs)
             task()
             return task
@@ -390,14 +417,22 @@ class MultiDeadlineExecutor(BareExecutor):
             if not self._was_ended():
                 raise
         finally:
-            self._pool.pause()
-            if is_over(self.context):
-                self._pool.close(0.5)
-                self._end_run()
-                if self._notifier is not None:
-                    self._notifier.stop()
-            self._close()
-            self._spinning.release()
+            try:  # a second interrupt may come here
+                self._pool.pause()
+                if is_over(self.context):
+                    self._pool.close(0.5)
+                    self._ending.end_run()
+                    if self._notifier is not None:
+                        self._notifier.stop()
+            finally:
+                self._end_spin()
+
+    def _end_spin(self) -> None:
+        """Let another thread spin, or end the executor if ``shutdown`` could not."""
+        self._ending.close()
+        self._spinning.release()
+        if self._must_shut_down:
+            self.shutdown()
 
     def _spin_until(self, done: Callable[[], bool], deadline: float | None) -> None:
         if self.is_ending() or is_over(self.context):
@@ -565,7 +600,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._check_context()
             raise
         finally:
-            self._spinning.release()
+            self._end_spin()
 
     def _step(self, deadline: float | None, done: Callable[[], bool]) -> bool:
         """
@@ -575,10 +610,10 @@ class MultiDeadlineExecutor(BareExecutor):
         :param done: whether to stop waiting.
         :return: whether a callback ran.
         """
-        if self._stepping is None:
-            self._stepping = select.epoll()
-            self._stepping.register(self._pool.loop.fd, select.EPOLLIN)
-            self._stepping.register(self._at_once.loop.fd, select.EPOLLIN)
+        if self._ending.stepping is None:
+            self._ending.stepping = select.epoll()
+            self._ending.stepping.register(self._pool.loop.fd, select.EPOLLIN)
+            self._ending.stepping.register(self._at_once.loop.fd, select.EPOLLIN)
         self._start_threads()
         if self._handle_once():
             return True
@@ -597,10 +632,11 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _wait_stepping(self, left: float | None) -> None:
         """Wait for an arrival or a due time; at most ``left`` seconds, None: for ever."""
-        assert self._stepping is not None
-        fd = self._stepping.fileno()
+        stepping = self._ending.stepping
+        assert stepping is not None
+        fd = stepping.fileno()
         if left is None or fd >= 1024:  # which ``select`` does not support
-            self._stepping.poll(-1 if left is None else left)
+            stepping.poll(-1 if left is None else left)
         else:
             select.select([fd], [], [], left)  # resolution 1 us; that of an epoll is 1 ms
 
@@ -610,55 +646,42 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Start no more callbacks and wait for the running ones.
 
+        In a signal handler that has interrupted the executor itself, it returns at once, and the
+        spin ends and does the rest.
+
         :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
         :return: whether all have finished.
         """
         if timeout_sec is not None and timeout_sec < 0:
             timeout_sec = None
         self.begin_end()
+        self._must_shut_down = self._pool.is_inside()
+        if self._must_shut_down:
+            self._pool.start_no_more()
+            self.wake()
+            return False
         self.wake()
         self._pool.pause()
         if not self._pool.close(timeout_sec):
             return False
-        self._end_run()
+        self._ending.end_run()
         reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
         if self._spinning.acquire(blocking=False):  # else the spin does that at its end
-            self._close()
+            self._ending.close()
             self._spinning.release()
         return finished and reported
 
-    def _close(self) -> None:
-        """Close the executor's descriptors, once it has ended."""
-        with self._ending:
-            if self._finished and self.is_ending():
-                if self._stepping is not None:
-                    self._stepping.close()
-                self._pool.loop.close()
-                self._at_once.loop.close()
-                self._pool.guard.close()
-                self._signals.close()
+    def begin_end(self) -> None:
+        """Ask the executor to end."""
+        super().begin_end()
+        self._ending.is_asked = True
 
-    def _end_run(self) -> None:
-        """Judge open jobs and close the trace, once; a second thread waits for the first."""
-        with self._ending:
-            if not self._finished:
-                self._finished = True
-                self._judge_and_close()
-
-    def _judge_and_close(self) -> None:
-        if self._diagnostics is not None:
-            self._diagnostics.stop()
-        self._wait_sets.stop()
-        self._upkeep.clear()
-        if self._announcements is not None:
-            self._announcements.close()
-        with self._pool.lock:
-            now = self._pool.tick()
-            end = min(now, self._pool.stopped_at or now)
-            self._engine.finish(now, end)
-        if self._recorder is not None:
-            self._recorder.close(now, end)
+    def __del__(self) -> None:
+        """End an executor that was never shut down: its threads and descriptors are freed."""
+        if self._ending is not None:  # else its construction has failed
+            self._ending.abandon()
+        super().__del__()  # type: ignore[no-untyped-call]
 
     def halt(self) -> None:
         """Start no more callbacks, as the interpreter ends; see ``wait_halted``."""

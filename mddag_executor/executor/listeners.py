@@ -129,7 +129,8 @@ class TimerFd:
     def __init__(self) -> None:
         self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self.fd < 0:
-            raise OSError(ctypes.get_errno(), 'timerfd_create')
+            error = ctypes.get_errno()
+            raise OSError(error, os.strerror(error))
         self.at = NEVER
         self._time = array('q', (0, 0, 0, 0))  # interval, then time: seconds, nanoseconds
         self._address = ctypes.c_void_p(self._time.buffer_info()[0])
@@ -146,3 +147,13 @@ class TimerFd:
         # 1: TFD_TIMER_ABSTIME
         if _timer_settime(self.fd, 1, self._address, None) != 0 and self.fd >= 0:
             raise OSError(f'timerfd_settime does not accept {self._time[2:].tolist()}')
+
+    def close(self) -> None:
+        """Close the descriptor, once."""
+        fd, self.fd = self.fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def __del__(self) -> None:
+        """Close the descriptor of an executor that could not be made."""
+        self.close()

@@ -23,6 +23,8 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from functools import cache
 import os
 import resource
 import select
@@ -32,6 +34,24 @@ from mddag_executor.executor.listeners import new_eventfd, TimerFd
 _EDGE = select.EPOLLIN | select.EPOLLET
 
 Events = list[tuple[int, int]]
+
+
+MOST_DESCRIPTORS = 65_536
+"""The soft limit of open files is raised to this at most: some programs visit each one."""
+
+
+@cache
+def raise_limit() -> None:
+    """
+    Raise the soft limit of open files of the process to the hard one; further calls do nothing.
+
+    The usual soft limit, 1,024, is for programs that use ``select``.  Child processes inherit it.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        with suppress(ValueError, OSError):  # a sandbox may forbid it
+            resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 class ChannelSource:
@@ -55,7 +75,17 @@ class ChannelSource:
 class EventLoop:
     """An epoll with its channels; all methods but ``wait`` and ``wake`` need one lock."""
 
+    _bell = _leave = -1
+
     def __init__(self) -> None:
+        self._free: list[int] = []
+        try:
+            self._open()
+        except BaseException:  # too many open files
+            self.close()
+            raise
+
+    def _open(self) -> None:
         self._epoll = select.epoll()
         #: waits for events until the timeout (s; -1: for ever), and returns them
         self.wait: Callable[..., Events] = self._epoll.poll
@@ -69,9 +99,9 @@ class EventLoop:
         self._epoll.register(self._nested_fd, _EDGE)
         self._channels: dict[int, tuple[ChannelSource, ...]] = {}
         self._shared: dict[str, int] = {}
-        self._free: list[int] = []
         # a quarter of the descriptors that the process may open
-        self._budget = resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4
+        soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        self._budget = (MOST_DESCRIPTORS if soft == resource.RLIM_INFINITY else soft) // 4
 
     @property
     def fd(self) -> int:
@@ -199,15 +229,16 @@ class EventLoop:
 
         Descriptors of sources that still have a listener stay open: it may write to them.
         """
-        fds = [*self._free, self._bell, self._leave, self.timer.fd]
-        self._bell = self._leave = self.timer.fd = -1
+        fds = [*self._free, self._bell, self._leave]
+        self._bell = self._leave = -1
         self._free.clear()
         self.wait = lambda *_: []
         for fd in fds:
             if fd >= 0:
                 os.close(fd)
-        self._epoll.close()
-        self._nested.close()
+        for name in ('timer', '_epoll', '_nested'):
+            if hasattr(self, name):  # else it could not be opened
+                getattr(self, name).close()
 
     def __del__(self) -> None:
         """Close the descriptors of an executor that was never shut down."""

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import inspect
 from queue import SimpleQueue
+import sys
 import threading
 import time
 from typing import TYPE_CHECKING
@@ -129,17 +130,16 @@ class MissLog:
     """Writes missed deadlines to the log, at a limited rate."""
 
     def __init__(self, verdicts: Verdicts) -> None:
-        frame = inspect.currentframe()
-        assert frame is not None
-        inspect.getframeinfo(frame)  # rule 4
+        inspect.getframeinfo(sys._getframe())  # rule 4; a variable would keep the caller alive
         self._verdicts = verdicts
         self._lock = threading.Lock()
         self._logged = 0
         self._at = 0.0
 
     def is_behind(self) -> bool:
-        """Return whether there were misses since the last line."""
-        return self._verdicts.missed != self._logged
+        """Return whether there were misses since the last line, and a line may be logged."""
+        return self._verdicts.missed != self._logged and (
+            not self._logged or time.monotonic() - self._at >= LOG_EVERY_S)
 
     def write(self) -> None:
         """Log the misses since the last line, if any; from any thread, without a lock."""
@@ -147,8 +147,8 @@ class MissLog:
             return
         try:
             now, count = time.monotonic(), self._verdicts.missed - self._logged
-            if self._logged and now - self._at < LOG_EVERY_S:
-                return
+            if count == 0:
+                return  # another thread has just logged them
             dag, sink, job, deadline_ns = self._verdicts.last_missed()
             since = f' within {now - self._at:.0f} s' if self._logged else ''
             since += ', the last' if count > 1 else ''

@@ -162,7 +162,9 @@ class Upkeep:
         loop = at_once.loop if entity.kind == CLIENT or entity.at_once else pool.loop
         source: Source | TimerSource
         if entity.kind == TIMER:
-            if entity.callback is None and ends_sleep(entity.rclpy.callback):
+            # ``create_rate`` sets the callback only after it has notified the executor
+            if entity.callback is None and (
+                    entity.rclpy.callback is None or ends_sleep(entity.rclpy.callback)):
                 loop = at_once.loop
             share = f'timers {entity.node}'
             source = TimerSource(entity, pool.timers if loop is pool.loop else at_once.timers)

@@ -74,7 +74,7 @@ class WaitableSource(ChannelSource):
     def __init__(self, entities: Iterable[Entity], pool: WorkerPool) -> None:
         self._by_id = {id(entity.rclpy): entity for entity in entities}
         self._pool = pool
-        self._set = FilledSet(pool.executor.context, [entity.rclpy for entity in entities])
+        self._set = FilledSet(pool.context, [entity.rclpy for entity in entities])
         self._timers: list[NextCall] = []
         self._has_parts = False
         self._set.parts(self._set.waitables, self._add_part)
@@ -222,13 +222,14 @@ class WaitSetThread:
     """
     A thread that waits for entities without a listener.
 
-    :param on_signal: called when rclpy's signal condition is triggered.
+    :param signals: rclpy's signal condition, or None.
+    :param on_signal: called when it is triggered.
     """
 
-    def __init__(self, pool: WorkerPool, on_signal: Callable[[], None]) -> None:
+    def __init__(self, pool: WorkerPool, signals: Any, on_signal: Callable[[], None]) -> None:
         self._pool = pool
-        self._context = pool.executor.context
-        self._signals = pool.executor.signal_guard()
+        self._context = pool.context
+        self._signals = signals
         self._on_signal = on_signal
         self._guard = GuardCondition(None, None, self._context)
         self._entities: list[Entity] = []

@@ -35,11 +35,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 import threading
 from time import monotonic_ns
 from typing import Any, TYPE_CHECKING
+import weakref
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core.queues import TURN_NS
@@ -54,6 +55,7 @@ from mddag_executor.executor.bounds import (
 from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock
 from mddag_executor.executor.due import DueTimes, Guard, Muting
+from mddag_executor.executor.ending import weakly
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.jobs import PublisherState
@@ -67,6 +69,10 @@ from mddag_executor.trace.groups import PUBLICATION
 if TYPE_CHECKING:
     from mddag_executor.executor.announcements import Announcements
     from mddag_executor.executor.executor import MultiDeadlineExecutor
+
+
+def _nothing() -> None:
+    pass
 
 
 class WorkerThread:
@@ -145,7 +151,6 @@ class WorkerPool:
     """
     The worker threads, with the lock and the clock of the engine.
 
-    :param executor: is woken when entities have changed, or its context has ended.
     :param fail: receives every exception that a callback raises.
     :param prepare_thread: called first in each worker thread (priority, CPU set).
     :ivar running: whether executions may start.
@@ -156,8 +161,8 @@ class WorkerPool:
     """
 
     def __init__(
-        self, engine: Engine, clock: TraceClock, executor: MultiDeadlineExecutor,
-        fail: Callable[[BaseException], None], prepare_thread: Callable[[], None] | None = None,
+        self, engine: Engine, clock: TraceClock, fail: Callable[[BaseException], None],
+        prepare_thread: Callable[[], None] | None = None,
     ) -> None:
         self.engine = engine
         engine.allow_bypass()
@@ -176,7 +181,10 @@ class WorkerPool:
         self.lent = 0
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
-        self.executor = executor
+        self.context: Any = None
+        #: called when entities have changed, or the context has ended
+        self.wake_executor: Callable[[], None] = _nothing
+        self._executor: Callable[[], MultiDeadlineExecutor | None] = _nothing
         self.fail = fail
         self._miss_log = MissLog(engine.verdicts)
         self._prepare_thread = prepare_thread
@@ -188,6 +196,7 @@ class WorkerPool:
         self._waiting_calls = 0
         self._bell_rings = False
         self._closed = False
+        self._at_end: Callable[[], None] = _nothing
         self._leaving = False
         self._all_left = threading.Event()
         self._is_stepping = False
@@ -202,6 +211,17 @@ class WorkerPool:
         self.due = DueTimes(self)
         #: wakes a thread when a short callback runs longer than expected
         self.guard = Guard(self._guard_expired)
+
+    def attach(self, executor: MultiDeadlineExecutor) -> None:
+        """Set the executor; threads do not keep it alive (``ending``)."""
+        self.context = executor.context
+        self._executor = weakref.ref(executor)
+        self.wake_executor = weakly(executor.wake)
+
+    @property
+    def executor(self) -> MultiDeadlineExecutor | None:
+        """Return the executor; None: it has been destroyed."""
+        return self._executor()
 
     # --- events ----------------------------------------------------------------------------------
 
@@ -345,10 +365,12 @@ class WorkerPool:
             self._leaving = True
             self._all_left.clear()
             self.loop.wake_all()
-        self._all_left.wait(END_S)
-        with self.lock:
-            self._leaving = False
-            self.loop.let_wait()
+        try:
+            self._all_left.wait(END_S)
+        finally:  # also after an interrupt
+            with self.lock:
+                self._leaving = False
+                self.loop.let_wait()
 
     def start_no_more(self) -> None:
         """Start no more executions; for callers that must not wait for the lock."""
@@ -365,14 +387,40 @@ class WorkerPool:
         self.pause()
         with self.lock:
             self._closed = True
-            while self._parked:
-                self._parked.pop().permit.release()
+            self._release_parked()
             threads = list(self._threads)
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
         done = True
         for each in threads:
             done = self._join(each, deadline) and done
         return done
+
+    def leave(self, then: Callable[[], None]) -> None:
+        """
+        End the threads without waiting for a lock or for them; no thread spins.
+
+        :param then: called when all have ended, by the last one; if there is none, soon.
+        """
+        self.start_no_more()
+        self._at_end = then
+        self._closed = True
+        self._release_parked()
+        if not self._threads:
+            self._all_have_ended()
+
+    def _all_have_ended(self) -> None:
+        """Do the rest of ``leave``, once."""
+        if self.is_inside():
+            self._defer(self._all_have_ended)
+            return
+        with self.lock:
+            then, self._at_end = self._at_end, _nothing
+        then()
+
+    def _release_parked(self) -> None:
+        with suppress(IndexError):  # without the lock another thread may take the last one
+            while True:
+                self._parked.pop().permit.release()
 
     @staticmethod
     def _join(each: WorkerThread, deadline: int | None) -> bool:
@@ -398,7 +446,13 @@ class WorkerPool:
             target=self._run, args=(me,), daemon=True, name=f'mddag-worker-{len(self._threads)}')
         self._threads.append(me)
         self._parked.append(me)
-        me.thread.start()
+        try:
+            me.thread.start()
+        except BaseException:  # too many threads, or an interrupt
+            if me.thread.ident is None:
+                self._threads.remove(me)
+                self._parked.remove(me)
+            raise
         return me
 
     def _run(self, me: WorkerThread) -> None:
@@ -420,11 +474,16 @@ class WorkerPool:
                 if me.waits_since:  # it has failed
                     me.waits_since = 0
                     self.polling -= 1
+                is_last = self._closed and not self._threads
+            if is_last:
+                self._all_have_ended()
 
     def _work(self, me: WorkerThread) -> None:
         """Take turns until the pool is closed."""
         loop, receive, go_on, execute = self.loop, self._receive, self._go_on, self._execute
         me.permit.acquire()
+        if self._closed:
+            return
         me.is_parked = False
         current.running = me
         found = go_on(me)
@@ -438,9 +497,9 @@ class WorkerPool:
                         receive(me, events)
                 found = go_on(me)
             elif me.is_parked:
+                me.permit.acquire()
                 if self._closed:
                     return
-                me.permit.acquire()
                 me.is_parked = False
                 found = go_on(me)
             else:
@@ -501,7 +560,7 @@ class WorkerPool:
                 else:
                     self._report_unusual_end(me, work, now)
                 if work.entity.removed:
-                    self.executor.wake()  # the registry can forget it now
+                    self.wake_executor()  # the registry can forget it now
                 if self.muting.until and not engine.holders:
                     self.muting.end()
                     self.due.arm(now - self._offset)  # muted timers have new due times
@@ -593,8 +652,9 @@ class WorkerPool:
         me.is_parked = True
         if is_left_to_leader and self.running and not self.polling:
             self._guard(self.now - self._offset)
-        if not self._closed:
-            self._parked.append(me)
+        self._parked.append(me)
+        if self._closed:  # it ends; checked last, as ``leave`` does not take the lock
+            self._release_parked()
 
     def thread_of(self, work: Work) -> WorkerThread | None:
         """Return the thread that runs an execution."""
@@ -622,8 +682,9 @@ class WorkerPool:
             me.outcome = error
         end = monotonic_ns()
         me.start, me.end = start + self._offset, end + self._offset
-        if measurement is None and not me.published and end - start <= SHORT_CALLBACK_NS:
-            habit.rests -= 1
+        if (measurement is None and not me.published
+                and entity.wall_ns <= SHORT_CALLBACK_NS >= end - start):
+            habit.rests -= 1  # an average of short executions stays short without it
         else:
             self._note_times(me, work, measurement, end - start)
         if self.callback_ended is not None and me.outcome is None:
@@ -671,7 +732,7 @@ class WorkerPool:
             self.deferred.append(partial(self._resume_after, work, outcome))
         else:
             is_gone = isinstance(outcome, Destroyed)
-            if is_over(self.executor.context):  # this may destroy nodes, too
+            if is_over(self.context):  # this may destroy nodes, too
                 engine.left_open(work, start, end, me.vtid, worker, not is_gone)
             elif is_gone:
                 engine.destroyed(work, now)
@@ -720,7 +781,8 @@ class WorkerPool:
                     self._admit()
         waits_before, me.waits = me.waits, me.has_lent
         try:
-            with self.executor.serve_meanwhile() if me.thread is None else nullcontext():
+            executor = self.executor if me.thread is None else None
+            with nullcontext() if executor is None else executor.serve_meanwhile():
                 yield
         finally:
             me.waits = waits_before

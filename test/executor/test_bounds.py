@@ -8,6 +8,7 @@ import threading
 
 from builtin_interfaces.msg import Time
 from mddag_executor.executor.bounds import MOST
+from mddag_executor.executor.loop import MOST_DESCRIPTORS, raise_limit
 from mddag_executor.executor.sources import SERVICE_DEPTH
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -25,6 +26,7 @@ from .declared import graph
 @pytest.fixture
 def few_files():
     """Let this process open no more than 256 files."""
+    raise_limit()  # once for the process
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (256, limits[1]))
     yield
@@ -55,6 +57,17 @@ def test_many_subscriptions_share_few_descriptors(make_executor, make_node):
         publishers[0].publish(Header())
         assert wait_for(lambda: late)
     assert all(each[:20] == [*range(20)] for each in heard)
+
+
+@pytest.mark.usefixtures('few_files')
+def test_the_soft_limit_of_open_files_is_raised_once(make_executor):
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    make_executor()
+    assert resource.getrlimit(resource.RLIMIT_NOFILE) == (256, hard)  # as set after the first
+    raise_limit.cache_clear()
+    make_executor()
+    most = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
+    assert resource.getrlimit(resource.RLIMIT_NOFILE) == (most, hard)
 
 
 # --- what waits ----------------------------------------------------------------------------------

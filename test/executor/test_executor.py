@@ -7,6 +7,11 @@ import threading
 import time
 
 from builtin_interfaces.msg import Time
+from mddag_executor.executor import workers
+from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
+from mddag_executor.executor.entity import Entity, TASK
+from mddag_executor.executor.work import current, Work
+from mddag_executor.executor.workers import WorkerThread
 import pytest
 from rclpy.callback_groups import (
     CallbackGroup,
@@ -15,10 +20,13 @@ from rclpy.callback_groups import (
 )
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future
+from rclpy.timer import Rate
 from std_msgs.msg import Header, Int32
 from std_srvs.srv import Trigger
 
 from .conftest import matched, Pulse, Spinning, wait_for
+
+MS = 1_000_000
 
 
 def test_subscriptions_of_each_kind(make_executor, make_node):
@@ -172,6 +180,71 @@ def test_a_callback_that_waits_may_lend_its_worker(make_executor, make_node):
     with Spinning(executor):
         assert wait_for(lambda: bool(seen), 30.0)
     assert seen == [True]
+
+
+def test_a_rate_that_is_found_before_it_has_its_callback_ends_a_sleep(make_executor, make_node):
+    """``create_rate`` sets it after it has notified the executor; the only worker sleeps then."""
+    node, slept, ran = make_node(), [], []
+    timer = node.create_timer(0.01, None, node._rate_group)
+    late = node.create_timer(0.01, None, ReentrantCallbackGroup())
+    executor = make_executor(num_workers=1, nodes=[node])
+    with Spinning(executor):
+        assert wait_for(lambda: executor._pool.is_current)
+        rate = Rate(timer, context=node.context)
+        task = executor.create_task(lambda: [slept.append(rate.sleep()) for _ in range(3)])
+        assert wait_for(task.done)
+        # a callback of the user's does not run in the thread that handles Rates
+        late.callback = lambda: ran.append(current.running)
+        assert wait_for(lambda: len(ran) >= 3)
+        assert all(running is not None for running in ran)
+    assert len(slept) == 3
+
+
+def test_one_slow_execution_does_not_make_a_callback_long(make_executor, monkeypatch):
+    """Each execution counts the same; short ones are measured seldom."""
+    pool, now, takes = make_executor()._pool, [10**12], [10_000]
+    monkeypatch.setattr(workers, 'monotonic_ns', lambda: now[0])
+    entity = Entity(TASK, None, '', None, -1, 0, '')
+    thread = WorkerThread(pool, None)
+
+    def run():
+        now[0] += takes[0]
+
+    def execute():
+        thread.work = Work(entity, run)
+        pool._execute(thread)
+        entity.ran += 1
+
+    for _ in range(100):
+        execute()
+    assert entity.wall_ns <= SHORT_CALLBACK_NS
+    takes[0] = 50 * MS
+    execute()
+    assert entity.wall_ns > SHORT_CALLBACK_NS
+    takes[0], before = 10_000, entity.ran
+    while entity.wall_ns > SHORT_CALLBACK_NS:
+        execute()
+    assert entity.ran - before < 30
+    for _ in range(3):  # it has become long
+        takes[0] = 10 * MS
+        execute()
+    assert entity.wall_ns > SHORT_CALLBACK_NS
+
+
+def test_a_response_makes_no_task(make_executor, make_node):
+    """The client forgets its request without a worker."""
+    node = make_node()
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    client = node.create_client(Trigger, '/ask')
+    executor = make_executor(nodes=[node])
+    assert client.wait_for_service(10.0)
+    future = client.call_async(Trigger.Request())
+    executor.spin_until_future_complete(future, 10.0)
+    assert future.done() and not client._pending_requests
+    cancelled = client.call_async(Trigger.Request())
+    cancelled.cancel()
+    assert not client._pending_requests
+    assert executor._task_entity.ready == 0
 
 
 def test_tasks_nodes_and_entities_wake_an_idle_executor(make_executor, make_node, spinning):

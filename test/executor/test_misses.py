@@ -12,9 +12,11 @@ import os
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from mddag_executor.core.tally import total
+from mddag_executor.executor import misses
 from mddag_executor.replay import replay
 from msg_graph import loads
 import pytest
@@ -198,6 +200,26 @@ def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path
     dag = replay(trace).result()['dags']['once']
     assert dag['ends'] == executor.statistics()['dags']['once']['ends']
     assert (dag['sinks']['/sink:end']['late'], dag['sinks']['/sink:end']['overdue']) == (1, 0)
+
+
+def test_between_two_lines_of_the_log_a_miss_costs_nothing(monkeypatch, capfd):
+    now = [100.0]
+    monkeypatch.setattr(misses, 'time', SimpleNamespace(monotonic=lambda: now[0]))
+    verdicts = SimpleNamespace(missed=0, last_missed=lambda: ('dag', 'sink', 7, 1_000_000))
+    log = misses.MissLog(verdicts)
+    assert not log.is_behind()
+    for missed, at, is_behind in ((1, 100.0, True), (2, 101.0, False), (3, 109.9, False),
+                                  (4, 110.0, True), (5, 119.0, False), (5, 120.0, True)):
+        verdicts.missed, now[0] = missed, at
+        assert log.is_behind() is is_behind
+        if is_behind:
+            log.write()
+            log.write()
+            assert not log.is_behind()
+    assert [line[line.index(']: ') + 3:] for line in capfd.readouterr().err.splitlines()] == [
+        '1 deadline missed: sink, 1 ms, job 7 of dag',
+        '3 deadlines missed within 10 s, the last: sink, 1 ms, job 7 of dag',
+        '1 deadline missed within 10 s: sink, 1 ms, job 7 of dag']
 
 
 def test_a_miss_in_the_last_step_is_logged(make_executor, make_node, capfd):

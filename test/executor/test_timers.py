@@ -173,9 +173,12 @@ def test_any_time_can_be_set_and_never_is_none():
             assert timer.at == at
             assert bool(select.select([timer.fd], [], [], 0)[0]) is is_due
     finally:
-        os.close(timer.fd)
+        timer.close()
+    timer.arm(1)  # as an executor that has ended may do
+    timer.fd = os.open(os.devnull, os.O_RDONLY)
     with pytest.raises(OSError, match='timerfd_settime'):
         timer.arm(1)
+    timer.close()
 
 
 # --- what is due or arrives before it is noticed -------------------------------------------------

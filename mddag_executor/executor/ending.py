@@ -1,0 +1,140 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The end of an executor: its run is judged, and its threads and descriptors are freed.
+
+Theory of operation
+-------------------
+1.  ``shutdown`` ends the executor and waits for running callbacks.  So does a spin that ends with
+    its context.
+2.  An executor that nobody shuts down ends when its context ends while it does not spin, or when
+    it is destroyed.  Neither can wait for a lock or a thread: a thread that owns any lock may be
+    the one that collects garbage.  So the parked workers are only told to end, and the last of
+    them does the rest.
+3.  Therefore nothing that a thread refers to may refer to the executor: threads would keep it
+    alive.  They have its methods by ``weakly``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+import select
+import sys
+import threading
+from typing import Any, TYPE_CHECKING
+import weakref
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.announcements import Announcements
+    from mddag_executor.executor.at_once import AtOnce, SignalPipe
+    from mddag_executor.executor.diagnostics import Diagnostics
+    from mddag_executor.executor.misses import MissNotifier
+    from mddag_executor.executor.recorder import Recorder
+    from mddag_executor.executor.upkeep import Upkeep
+    from mddag_executor.executor.waitables import WaitSetThread
+    from mddag_executor.executor.workers import WorkerPool
+
+
+def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that calls a method as long as its object is alive, else returns None."""
+    reference = weakref.WeakMethod(method)
+
+    def call(*args: Any) -> Any:
+        living = reference()
+        return None if living is None else living(*args)
+
+    return call
+
+
+class Ending:
+    """
+    Ends the parts of an executor, each once.
+
+    :ivar is_asked: whether the executor has been asked to end.
+    :ivar is_asked: whether the executor has been asked to end.
+    :ivar stepping: the epoll of ``spin_once``, once there is one.
+    """
+
+    def __init__(
+        self, pool: WorkerPool, at_once: AtOnce, signals: SignalPipe, recorder: Recorder | None,
+        notifier: MissNotifier | None,
+    ) -> None:
+        self.is_asked = False
+        self.stepping: select.epoll | None = None
+        self.wait_sets: WaitSetThread | None = None
+        self.upkeep: Upkeep | None = None
+        self.diagnostics: Diagnostics | None = None
+        self.announcements: Announcements | None = None
+        self._pool = pool
+        self._at_once = at_once
+        self._signals = signals
+        self._recorder = recorder
+        self._notifier = notifier
+        # reentrant: a signal handler may end the run in the thread that is ending it
+        self._lock = threading.RLock()
+        self._has_ended = False
+        self._pid = os.getpid()
+
+    def end_run(self) -> None:
+        """Judge open jobs and close the trace, once; a second thread waits for the first."""
+        with self._lock:
+            if not self._has_ended:
+                self._has_ended = True
+                self._judge_and_close()
+
+    def _judge_and_close(self) -> None:
+        for each in (self.diagnostics, self.wait_sets):
+            if each is not None:
+                each.stop()
+        if self.upkeep is not None:
+            self.upkeep.clear()
+        if self.announcements is not None:
+            self.announcements.close()
+        pool = self._pool
+        with pool.lock:
+            now = pool.tick()
+            end = min(now, pool.stopped_at or now)
+            pool.engine.finish(now, end)
+        if self._recorder is not None:
+            self._recorder.close(now, end)
+
+    def close(self) -> None:
+        """Close the descriptors, once the run has ended and no thread uses them."""
+        with self._lock:
+            if self._has_ended and self.is_asked:
+                self._close_descriptors()
+
+    def _close_descriptors(self) -> None:
+        if self.stepping is not None:
+            self.stepping.close()
+        self._pool.loop.close()
+        self._at_once.loop.close()
+        self._pool.guard.close()
+        self._signals.close()
+
+    def abandon(self) -> None:
+        """
+        End everything, soon and without waiting; no thread spins.
+
+        If threads have been started, the last worker does it (rule 2).
+        """
+        if self._has_ended and self.is_asked or sys.is_finalizing():
+            return
+        self.is_asked = True
+        if os.getpid() != self._pid:
+            return self._close_descriptors()  # a forked child: the threads are the parent's
+        self._pool.leave(self._end_all)
+
+    def _end_all(self) -> None:
+        self.end_run()
+        if self._notifier is not None:
+            self._notifier.stop()
+        self.close()
+
+    def undo(self) -> None:
+        """Free everything again, as the executor could not be made."""
+        self._has_ended = self.is_asked = True
+        if self.announcements is not None:
+            self.announcements.close()
+        self._close_descriptors()

@@ -1,0 +1,226 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What frees the threads and descriptors of an executor, also if nobody shuts it down."""
+
+import gc
+import os
+import resource
+import sys
+import threading
+import weakref
+
+from mddag_executor import MultiDeadlineExecutor
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.task import Future
+from std_msgs.msg import Header
+
+from .conftest import Spinning, wait_for
+
+LIMIT = resource.RLIMIT_NOFILE
+
+
+def used():
+    """Return how many threads and descriptors there are."""
+    return threading.active_count(), len(os.listdir('/proc/self/fd'))
+
+
+def busy_node(context):
+    """Return a node with a timer and a subscription that run."""
+    node = Node('busy', context=context, start_parameter_services=False, enable_rosout=False)
+    publisher = node.create_publisher(Header, '/topic', 10)
+    node.heard = []
+    node.create_subscription(Header, '/topic', node.heard.append, 10)
+    node.create_timer(0.002, lambda: publisher.publish(Header()))
+    return node
+
+
+def run(executor, node):
+    before, calls = len(node.heard), 0
+    while len(node.heard) < before + 3:
+        calls += 1
+        if calls % 2:
+            executor.spin_until_future_complete(Future(), 0.05)
+        else:
+            executor.spin_once(0.05)
+
+
+# --- nobody shuts it down ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('has_spun', [False, True])
+@pytest.mark.parametrize('is_in_cycle', [False, True])
+def test_an_executor_that_is_dropped_is_freed(ros_context, tmp_path, has_spun, is_in_cycle):
+    """Its trace is complete then.  In a cycle, it takes the garbage collector."""
+    node = busy_node(ros_context)
+    if has_spun:  # what the middleware opens at first
+        with MultiDeadlineExecutor(context=ros_context) as first:
+            first.add_node(node)
+            run(first, node)
+    before = used()
+    executor = MultiDeadlineExecutor(
+        context=ros_context, trace=tmp_path / 'run.mcap', diagnostics_period='50ms',
+        on_deadline_miss=print)
+    executor.add_node(node)
+    if has_spun:
+        run(executor, node)
+    if is_in_cycle:
+        node.executor_of_its_own = executor
+    reference = weakref.ref(executor)
+    del executor, node
+    if is_in_cycle:
+        gc.collect()
+    assert reference() is None
+    assert wait_for(lambda: used()[0] == before[0] and used()[1] <= before[1])
+    assert wait_for(lambda: (tmp_path / 'run.mcap').read_bytes().endswith(b'\x89MCAP0\r\n'))
+
+
+def test_a_dropped_executor_is_freed_after_a_callback_that_still_runs(ros_context):
+    node, go_on, begun = busy_node(ros_context), threading.Event(), threading.Event()
+    before = threading.active_count()
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    executor.create_task(lambda: begun.set() or go_on.wait(30.0))
+    while not begun.is_set():
+        executor.spin_until_future_complete(Future(), 0.01)
+    executor.remove_node(node)
+    del executor
+    assert wait_for(lambda: threading.active_count() <= before + 2), threading.enumerate()
+    go_on.set()
+    assert wait_for(lambda: threading.active_count() == before)
+
+
+@pytest.mark.parametrize('has_spun', [False, True])
+def test_the_end_of_its_context_frees_an_executor_that_does_not_spin(has_spun, no_thread_leak):
+    """As in fixtures of tests that initialise rclpy and shut it down again."""
+    executors, counts, before = [], [], threading.active_count()
+    for _ in range(4):
+        context = Context()
+        rclpy.init(context=context)
+        node = busy_node(context)
+        executor = MultiDeadlineExecutor(context=context)
+        executors.append(executor)  # it is not dropped
+        executor.add_node(node)
+        if has_spun:
+            run(executor, node)
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+        assert wait_for(lambda: threading.active_count() == before)
+        if has_spun:
+            assert wait_for(lambda: executors[-1]._pool.loop._bell < 0)
+            counts.append(used())
+    assert len(set(counts)) == has_spun
+    for executor in executors:
+        executor.statistics()
+        with pytest.raises(ExternalShutdownException):
+            executor.spin_once(0.1)
+        assert executor.shutdown(5.0) and executor.is_gone()
+
+
+# --- ends at bad times ---------------------------------------------------------------------------
+
+
+def test_shutdown_in_a_handler_that_interrupts_the_executor_itself(ros_context):
+    """The workers wait for the lock that this thread owns, so it cannot wait for them."""
+    executor = MultiDeadlineExecutor(context=ros_context)
+    node = busy_node(ros_context)
+    executor.add_node(node)
+    with Spinning(executor) as spinning:
+        assert wait_for(lambda: len(node.heard) >= 3)
+        with executor._pool.lock:
+            assert not executor.shutdown()
+        spinning.join()
+        assert executor.is_gone() and executor._pool.loop._bell < 0
+
+
+def test_an_interrupt_at_the_end_of_a_spin_leaves_an_executor_that_can_be_shut_down(monkeypatch):
+    context = Context()
+    rclpy.init(context=context)
+    executor = MultiDeadlineExecutor(context=context)
+    close = executor._pool.close
+
+    def interrupted(timeout):
+        monkeypatch.setattr(executor._pool, 'close', close)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(executor._pool, 'close', interrupted)
+    executor.create_task(rclpy.shutdown, context=context)
+    with pytest.raises(KeyboardInterrupt):
+        executor.spin()
+    assert not executor.is_spinning
+    assert executor.shutdown(5.0) and executor._pool.loop._bell < 0
+    executor.spin_once(0.0)
+
+
+def test_an_interrupt_of_a_pause_does_not_keep_the_workers_awake(make_executor, monkeypatch):
+    executor = make_executor()
+    wait = executor._pool._all_left.wait
+
+    def interrupted(timeout):
+        monkeypatch.setattr(executor._pool._all_left, 'wait', wait)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(executor._pool._all_left, 'wait', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        executor.spin_until_future_complete(Future(), 0.05)
+    executor.spin_until_future_complete(executor.create_task(lambda: None), 5.0)
+
+
+# --- limits of the system ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('left', range(6))
+def test_a_thread_that_cannot_be_started_is_started_by_the_next_spin(
+        make_executor, make_node, monkeypatch, left):
+    """With three workers, a wait-set thread, one for misses and one for diagnostics."""
+    node, ran, start = make_node(), [], threading.Thread.start
+    node.create_timer(0.002, lambda: ran.append(1))
+    executor = make_executor(
+        num_workers=3, nodes=[node], diagnostics_period='50ms', on_deadline_miss=print)
+    started = []
+
+    def limited(thread):
+        if len(started) == left:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    with monkeypatch.context() as limit:
+        limit.setattr(threading.Thread, 'start', limited)
+        with pytest.raises(RuntimeError, match='new thread'):
+            executor.spin_until_future_complete(Future(), 5.0)
+    before = len(ran)
+    with Spinning(executor):
+        assert wait_for(lambda: len(ran) >= before + 3)
+        names = {thread.name for thread in threading.enumerate()}
+        assert names >= {'mddag-diagnostics', 'mddag-wait-set', 'mddag-deadline-misses'}
+        assert len(executor._pool._threads) == 3
+
+
+def test_too_many_open_files_leave_nothing_behind(ros_context, monkeypatch, tmp_path):
+    """Whichever descriptor the constructor cannot open."""
+    MultiDeadlineExecutor(context=ros_context).shutdown()
+    unraisable, limits, errors = [], resource.getrlimit(LIMIT), 0
+    monkeypatch.setattr(sys, 'unraisablehook', unraisable.append)
+    before = used()
+    for more in range(40):
+        resource.setrlimit(LIMIT, (before[1] + more, limits[1]))
+        try:
+            executor = MultiDeadlineExecutor(
+                context=ros_context, trace=tmp_path / 'run.mcap', overwrite=True)
+        except Exception as error:  # the trace's own; too many open files
+            assert 'open files' in str(error).lower(), (more, error)
+            errors += 1
+        else:
+            executor.shutdown()
+            break
+        finally:
+            resource.setrlimit(LIMIT, limits)
+    assert errors >= 8
+    del executor
+    gc.collect()
+    assert wait_for(lambda: used()[0] <= before[0] and used()[1] <= before[1])
+    assert unraisable == []
