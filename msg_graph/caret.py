@@ -19,9 +19,7 @@ find a value, and that it was not filled in.
    no callback does, on the topic. The other contexts (``callback_chain``,
    ``inherit_unique_stamp``) repeat the variable passings.
 4. A mutually exclusive callback group counts if it has several callbacks.
-5. In 2021 files had ``type`` for ``callback_type``, one ``callback_name`` for each published
-   topic, and paths that list callbacks (``path_name_aliases``).
-6. Other keys are ignored: the format grows.
+5. Other keys are ignored: the format grows.
 """
 
 from __future__ import annotations
@@ -42,10 +40,13 @@ def read_architecture(text: str, file: str) -> Draft:
     """Return the contents of an architecture file; ``file`` is its name."""
     remedy = "give an architecture file as caret_analyze's Architecture.export writes it"
     tree: Any = plain(parse_yaml(text, file))
+    if isinstance(tree, dict) and 'path_name_aliases' in tree:
+        raise GraphError(
+            file, None, 'CARET wrote this architecture file before ROS 2 Humble; such files are '
+            'not read any more', 'write it with CARET of Humble or later')
     try:
         nodes = [_node(each) for each in tree['nodes'] or ()]
         paths = [_path(each) for each in tree.get('named_paths') or ()]
-        paths += [_alias(each) for each in tree.get('path_name_aliases') or ()]
     except ValueProblem as wrong:
         raise GraphError(file, None, wrong.problem, wrong.remedy) from None
     except KeyError as missing:
@@ -88,7 +89,7 @@ def _callback(tree: Plain, node: str) -> DraftCallback:
     full = tree['callback_name']
     name = CALLBACK.check(
         full[len(node) + 1:] if full.startswith(f'{node}/') else full.rpartition('/')[2])
-    kind = tree['type' if 'type' in tree else 'callback_type'].removesuffix('_callback')
+    kind = tree['callback_type'].removesuffix('_callback')
     if kind == 'timer':
         period = tree['period_ns']
         if not (period.isdecimal() and MICROSECOND <= int(period[:19]) <= DAY):
@@ -114,7 +115,7 @@ def _group(node: DraftNode, tree: Plain) -> None:
 
 def _publisher(node: DraftNode, tree: Plain) -> None:
     topic = TOPIC.check(tree['topic_name'])
-    names = tree.get('callback_names') or [tree.get('callback_name')]
+    names = tree.get('callback_names') or ()
     known = [node.callbacks[name] for name in names if name in node.callbacks]
     if not known and len(node.callbacks) == 1:
         known = list(node.callbacks.values())
@@ -143,11 +144,6 @@ def _path(tree: Plain) -> DraftPath:
     return DraftPath(_text(tree, 'path_name'), [
         (_text(each, 'node_name'), _text(each, 'subscribe_topic_name'),
          _text(each, 'publish_topic_name')) for each in tree['node_chain'] or ()])
-
-
-def _alias(tree: Plain) -> DraftPath:
-    pairs = [text.rpartition('/') for text in tree['callbacks']]
-    return DraftPath(_text(tree, 'path_name'), [], [f'{node}:{name}' for node, _, name in pairs])
 
 
 def _text(tree: Plain, key: str) -> str:

@@ -17,10 +17,14 @@ from ..cli import golden
 from .helpers import GOLDEN
 
 
-@pytest.mark.parametrize('name', ['caret', 'caret_2021'])
-def test_an_architecture_file(name):
-    text = declaration_of(read_architecture((GOLDEN / f'{name}.yaml').read_text(), 'arch.yaml'))
-    golden.compare(name, text, GOLDEN)
+def test_a_file_from_before_humble_is_refused_in_one_line():
+    with pytest.raises(GraphError, match='^a.yaml: CARET wrote .* before ROS 2 Humble; .*: write'):
+        read_architecture('path_name_aliases: []\nnodes: []\n', 'a.yaml')
+
+
+def test_an_architecture_file():
+    text = declaration_of(read_architecture((GOLDEN / 'caret.yaml').read_text(), 'arch.yaml'))
+    golden.compare('caret', text, GOLDEN)
     # All blanks at once, with their lines, instead of the errors that come of them.
     blanks = [n for n, line in enumerate(text.splitlines(), 1) if f'# {MARK}: ' in line]
     with pytest.raises(GraphError) as caught:
