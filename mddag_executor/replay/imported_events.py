@@ -22,6 +22,7 @@ from mddag_executor.trace.schema import (
     BEFORE_HUMBLE,
     BEFORE_HUMBLE_PROBLEM,
     BEFORE_HUMBLE_REMEDY,
+    PROCESS,
 )
 from mddag_executor.trace.times import NEVER
 import numpy as np
@@ -69,12 +70,14 @@ class Events(NamedTuple):
     :ivar threads: process and thread id.
     :ivar others: the other events, as tuples with a ``Layout``, in the order of time.
     :ivar warning: events at impossible times, which were left out; empty: none.
+    :ivar names: the last name of a thread, by process and thread id.
     """
 
     table: Table
     threads: list[tuple[int, int]]
     others: list[Event]
     warning: str
+    names: Mapping[tuple[int, int], str] = {}
 
 
 def moved(events: Events, shift: Mapping[int, int]) -> Events:
@@ -105,8 +108,9 @@ def read_events(
     """Return the events of a trace: those of ``kinds`` as a table, and ``others`` as tuples."""
     parts: list[Table] = [np.zeros(0, _EVENT)]
     tuples: list[tuple[int, Event]] = []
+    names_of: dict[tuple[int, int], str] = {}
     count = 0
-    for batch in reader.batches({*kinds, *others, *BEFORE_HUMBLE}, as_table=False):
+    for batch in reader.batches({*kinds, *others, *BEFORE_HUMBLE, PROCESS}, as_table=False):
         for head, rows, places in batch.tables:
             if head[0].name in BEFORE_HUMBLE:
                 raise TraceError(reader.path, BEFORE_HUMBLE_PROBLEM, BEFORE_HUMBLE_REMEDY)
@@ -116,6 +120,9 @@ def read_events(
                 tuples += zip(places.tolist(), (head + row for row in rows.tolist()))
         for place, event in batch.others:
             layout = event[0]
+            if layout.name == PROCESS:
+                names_of[event[2], event[3]] = str(event[4])
+                continue
             if layout.name in kinds:
                 names = ('timestamp', 'vpid', 'vtid', *layout.fields)
                 numbers = {name: value for name, value in zip(names, event[1:])
@@ -143,7 +150,7 @@ def read_events(
         f'{impossible[0]} ns')
     return Events(
         table[possible], [(each >> 32, (each & 0xFFFFFFFF) - (each & 0x80000000) * 2)
-                          for each in threads.tolist()], kept, warning)
+                          for each in threads.tolist()], kept, warning, names_of)
 
 
 def _normal(rows: Table, places: Ints, kind: tuple[Any, ...]) -> Table:

@@ -147,9 +147,16 @@ class ImportedRun:
             publications=self._publications(), job_ends=jobs.ends, takes=self._takes(),
             start=earliest(table['ready'], jobs.releases['release']), end=self.end,
             judged_until=self._judged_until(), lost=links.discarded,
-            workers_each=self.head.workers, links=True, callback_vertex=self._vertex)
+            workers_each=self.head.workers, links=True, callback_vertex=self._vertex,
+            worker_names=self._worker_names())
         found.warnings = self._warnings(found)
         return found
+
+    def _worker_names(self) -> list[str]:
+        """Return the names of the threads that ran callbacks, by worker."""
+        names = self._events.names
+        return [f'{names.get((pid, tid)) or "process"} {pid}, thread {tid}'
+                for pid, tid in self._workers] if self._imported else []
 
     def _executions(self) -> Table:
         """Return the executions, without jobs."""
@@ -157,8 +164,10 @@ class ImportedRun:
         ended = np.flatnonzero(runs['end_at'] >= 0)
         ended = ended[sort_by(runs['end_at'][ended])]
         threads, first = np.unique(runs['thread'][ended], return_index=True)
+        threads = threads[sort_by(first)]
         worker = np.full(len(events.threads), UNKNOWN)
-        worker[threads[sort_by(first)]] = np.arange(len(threads))
+        worker[threads] = np.arange(len(threads))
+        self._workers = [events.threads[each] for each in threads.tolist()]
         table = rows(
             EXECUTIONS, len(runs), callback=_values(
                 [each.number for each in self.links.callbacks], runs['callback']),

@@ -126,10 +126,14 @@ class _Writer:
         known = of['release_ns'].known
         assert known is not None
 
+        names = self._recording.worker_names
+
         def of_worker(row: int) -> tuple[str, int, int]:
             worker = int(table['worker'][row])
-            return (f'worker {worker}', _WORKERS, worker) if worker >= 0 else (
-                'spare threads', _WORKERS, 1 << 20)
+            if worker < 0:
+                return 'spare threads', _WORKERS, 1 << 20
+            return (printable(names[worker]) if worker < len(names) else f'worker {worker}',
+                    _WORKERS, worker)
 
         def of_callback(row: int) -> tuple[str, int, int]:
             dag = int(table['dag'][row]) if declared[row] else -1

@@ -25,11 +25,12 @@ from mddag_executor.report.html_data import (
     shown_misses,
 )
 from mddag_executor.report.html_tables import html_table
+from mddag_executor.report.perfetto import write_perfetto
 import msg_graph
 import numpy as np
 import pytest
 
-from ..replay.recorded import four_jobs
+from ..replay.recorded import four_jobs, Recorded
 from . import runs
 
 
@@ -155,6 +156,22 @@ def test_a_run_without_graph_shows_its_messages_and_nothing_of_misses(tmp_path):
     assert '<h2>Messages</h2>' in text and '>/detect subscription /image<' in text
     for name in ('mddag-next', 'mddag-previous', 'class="missed"', '<h2>Missed', 'class="gap"'):
         assert name not in text[:text.index('<script')], name
+
+
+def test_threads_of_imported_recordings_have_the_names_of_their_processes(tmp_path):
+    recorded = Recorded(tmp_path / 'run.mcap')
+    for pid, tid, name in ((1, 7, 'camera_main'), (2, 9, '')):
+        recorded.node(1, f'/n{pid}', pid=pid)
+        recorded.timer(11, 1, 100 * runs.MS, pid=pid)
+        recorded.run(11, tid, 100 * runs.MS, (100 + pid) * runs.MS, pid=pid)
+        if name:
+            recorded.add('mddag:process', 0, tid, name, pid=pid)
+    outcome = replay(recorded.write())
+    assert drawn(html.of_outcome(outcome))['workers'] == [
+        'camera_main 1, thread 7', 'process 2, thread 9']
+    file = io.BytesIO()
+    write_perfetto(file, outcome)
+    assert b'camera_main 1, thread 7' in file.getvalue()
 
 
 def test_what_is_left_out_is_hatched_and_in_the_legend(tmp_path, monkeypatch):
