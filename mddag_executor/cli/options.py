@@ -165,7 +165,7 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
     '--report': {
         'metavar': 'OUT.html', 'type': Report,
         'help': 'write tables and pictures of the run as one HTML file that needs no network '
-        "(needs mddag_executor[report]; '-': to standard output)"},
+        "('-': to standard output)"},
     '--workers': {
         'type': workers, 'metavar': 'M', 'help': 'threads that run callbacks',
         'otherwise': f"the declaration's, else {defaults.WORKERS}"},
