@@ -12,7 +12,8 @@ Theory of operation
    executions that ended within the part are kept, too, because they may have delayed a job; their
    jobs are not judged.
 3. Rows are not cut.  An execution that began before the range and ended in it is in the part.
-4. Times stay on the clock of the recording; ``start`` becomes the begin of the range.
+4. What is usual is that of the whole recording (``whole``), not of the part.
+5. Times stay on the clock of the recording; ``start`` becomes the begin of the range.
 """
 
 from __future__ import annotations
@@ -89,4 +90,4 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
         losses=pick(losses, (losses['time'] >= begin) & (losses['time'] < last)),
         demotions=pick(demotions, (demotions['time'] >= begin) & (demotions['time'] < last)),
         misses=pick(recording.misses, judged[jobs.of(recording.misses)]),
-        start=begin, end=until, judged_releases=(begin, end))
+        start=begin, end=until, judged_releases=(begin, end), whole=recording.whole or recording)

@@ -174,6 +174,7 @@ class Recording:
     :ivar callback_vertex: by callback a vertex of its declared callback, for executions without
         job.
     :ivar messages: number of messages of an ordinary bag; None: it is a trace.
+    :ivar whole: the recording that it is a part of; None: it is a whole one.
     :ivar notes: assumptions, one line each; ``warnings``: missing or doubtful data.
     """
 
@@ -214,6 +215,7 @@ class Recording:
     links: bool = False
     callback_vertex: dict[int, int] = field(default_factory=dict)
     messages: int | None = None
+    whole: Recording | None = field(default=None, repr=False)
     notes: Sequence[str] = ()
     warnings: list[str] = field(default_factory=list)
     _keys: dict[int, str] | None = field(default=None, init=False, repr=False)
@@ -311,8 +313,9 @@ class JobNumbers:
     def __init__(self, released: Table) -> None:
         self._released = released
         self._numbers = np.unique(released['job'])
-        self._dags = int(released['dag'].max(initial=-1)) + 1
-        self.none = self._dags * len(self._numbers)
+        self._keys = np.empty(0, dtype=np.int64)
+        self._keys = np.unique(self._key(released['dag'], released['job']))
+        self.none = len(self._keys)
 
     def of(self, table: Table) -> Ints:
         """Return the job numbers of rows."""
@@ -320,9 +323,14 @@ class JobNumbers:
 
     def of_jobs(self, dag: Any, job: Any) -> Ints:
         """Return the job numbers of DAGs and jobs."""
+        key = self._key(dag, job)
+        at = np.searchsorted(self._keys, key)
+        return np.where((key >= 0) & (np.append(self._keys, UNKNOWN)[at] == key), at, self.none)
+
+    def _key(self, dag: Any, job: Any) -> Ints:
+        """Return a number for any DAG and job; ``UNKNOWN`` for unknown ones."""
         dag, at = dag.astype(np.int64), look_up(self._numbers, job)
-        known = (dag >= 0) & (dag < self._dags) & (at >= 0)
-        return np.where(known, dag * len(self._numbers) + at, self.none)
+        return np.where((dag >= 0) & (at >= 0), dag * len(self._numbers) + at, UNKNOWN)
 
     def marked(self, which: Mask) -> Mask:
         """Return by number whether the job is one of the chosen releases."""

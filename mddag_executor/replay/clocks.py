@@ -19,9 +19,10 @@ Theory of operation
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
+from mddag_executor.recording.tables import different, Ints, rows_by
 from mddag_executor.trace import TraceReader
 import numpy as np
 
@@ -31,6 +32,10 @@ SAME_PUBLICATION = 10_000_000
 HOST = 'mddag:host'
 _NODES = ('ros2:rcl_publisher_init', 'ros2:rcl_subscription_init')
 _PUBLISH, _TAKE = 'ros2:rclcpp_publish', 'ros2:rmw_take'
+_COLUMNS = {
+    _PUBLISH: ('publisher_handle', 'timestamp'),
+    _TAKE: ('rmw_subscription_handle', 'source_timestamp')}
+"""The fields of events: the handle, and a time."""
 
 Ways = dict[tuple[int, int], int]
 """By two machines the minimum time of a message from one to the other, by their clocks."""
@@ -66,20 +71,53 @@ class Messages:
     """
 
     def __init__(self, reader: TraceReader) -> None:
-        topics: dict[int, str] = {}
-        sent: dict[str, list[int]] = defaultdict(list)
-        taken: dict[str, list[tuple[int, int]]] = defaultdict(list)
-        for event in reader.events({*_NODES, _PUBLISH, _TAKE}, sorted=True):
-            if None in event:
-                continue
-            if event[0] in _NODES:
-                topics[event[4]] = event[7]
-            elif event[4] in topics and event[0] == _PUBLISH:
-                sent[topics[event[4]]].append(event[1])
-            elif event[4] in topics:
-                taken[topics[event[4]]].append((event[6], event[1]))
-        self.sent = {topic: np.array(times) for topic, times in sent.items()}
-        self.taken = {topic: np.array(pairs) for topic, pairs in taken.items()}
+        made: dict[int, list[tuple[int, str]]] = defaultdict(list)
+        found: dict[str, list[Ints]] = {_PUBLISH: [], _TAKE: []}
+        for batch in reader.batches({*_NODES, _PUBLISH, _TAKE}):
+            others = [event for _, event in batch.others if None not in event]
+            for (name, *_), table, _ in batch.tables:
+                if name in found:
+                    found[name].append(_columns(*(
+                        table[field] for field in ('timestamp', *_COLUMNS[name]))))
+                else:
+                    others += [(name, *row) for row in table.tolist()]
+            for event in others:
+                if event[0] in _NODES:
+                    made[event[4]].append((event[1], event[7]))
+                else:
+                    stamp = event[6] if event[0] == _TAKE else event[1]
+                    found[event[0]].append(_columns(
+                        *([value] for value in (event[1], event[4], stamp))))
+        self.sent = {topic: np.sort(rows[0]) for topic, rows in _by_topic(
+            found[_PUBLISH], made)}
+        self.taken = {topic: rows[[2, 0]].T for topic, rows in _by_topic(found[_TAKE], made)}
+
+
+def _columns(time: Any, handle: Any, stamp: Any) -> Ints:
+    """Return events as three rows of numbers."""
+    return np.array([np.asarray(each).astype(np.int64) for each in (time, handle, stamp)])
+
+
+def _by_topic(
+    parts: Sequence[Ints], made: Mapping[int, list[tuple[int, str]]]
+) -> Iterator[tuple[str, Ints]]:
+    """
+    Yield the topics of events, and the events of each.
+
+    :param made: by handle when it was initialised, and its topic.
+    """
+    events = np.concatenate([np.empty((3, 0), dtype=np.int64), *parts], axis=1)
+    handles, which = different(events[1])
+    found: dict[str, list[Ints]] = defaultdict(list)
+    for handle, mine in zip(handles.tolist(), rows_by(which, len(handles))):
+        inits = sorted(made.get(handle, ()))
+        newest = np.searchsorted([time for time, _ in inits], events[0, mine], 'right') - 1
+        for number, (_, topic) in enumerate(inits):
+            found[topic].append(events[:, mine[newest == number]])
+    for topic, each in found.items():
+        rows = np.concatenate(each, axis=1)
+        if rows.shape[1]:
+            yield topic, rows
 
 
 def ways(traces: Sequence[Messages], machine: Sequence[int], shifts: Sequence[int]) -> Ways:

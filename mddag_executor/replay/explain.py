@@ -142,19 +142,21 @@ class Explanation:
 
     def _usual(self) -> Usual:
         """Return the usual times of callbacks and releases."""
-        task_set, table = self._task_set, self._executions
+        recording = self._recording.whole or self._recording
+        task_set = self._task_set
+        table = recording.executions[:None if len(self._executions) else 0]
         place = np.array([*task_set.places_of_vertices(), 0], dtype=np.int64)
         longest = [_NO_END if v.callback.execution_time is None
                    else v.callback.execution_time.quantiles_ns[-1] for v in task_set.vertices]
         # the last message of a sync vertex starts it; the others are only stored
-        rows = self._rows
+        rows = self._rows if self._recording.whole is None else ran(table)
         whole = rows[(table['completes'][rows] == VERTEX) & (table['vertex'][rows] >= 0)]
         of = place[table['vertex'][whole]]
         count = len(task_set.callbacks) + 1
         runs = medians(of, table['end'][whole] - table['began'][whole], count)
         cpu = table['cpu'][whole]
         computed = medians(of[cpu >= 0], cpu[cpu >= 0], count)
-        releases = self._recording.releases
+        releases = recording.releases
         lags = medians(
             releases['dag'], releases['noticed'] - releases['release'], len(task_set.dags) + 1)
         return Usual(np.minimum(runs[place], np.array([*longest, 0])), computed[place], lags)

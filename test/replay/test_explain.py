@@ -5,7 +5,7 @@
 from hypothesis import example, given
 from hypothesis import strategies as st
 from mddag_executor.core.tally import counts, total
-from mddag_executor.replay import open_recording, replay, reschedule
+from mddag_executor.replay import open_recording, Replay, replay, reschedule
 from mddag_executor.replay.causes import CAUSES, REMEDIES
 import pytest
 
@@ -351,3 +351,19 @@ nodes:
     in_time = [counts(reschedule(trace, on_late=on_late).result()['dags']['a']['sinks'][
         '/n:main']).in_time for on_late in ('continue', 'demote')]
     assert in_time[0] < 20 and in_time[1] >= 99
+
+
+def test_what_is_usual_in_the_whole_recording_is_usual_in_a_part(tmp_path):
+    trace = Written(tmp_path / 'a.mcap', 'mddag: 1\nnodes:\n  - {node: /a, callbacks: '
+                    '[{name: tick, timer: 100ms, deadline: 30ms}]}\n')
+    for job in range(30):
+        at = 100 * job
+        trace.release(0, job, at, at + 5)       # noticed 5 ms late, always
+        trace.run(0, 0, job, at + 5, at + (45 if job >= 24 else 10))
+    path = trace.end(3000)
+    whole, part, again = (open_recording(path), open_recording(path).cut(2400 * MS, 3000 * MS),
+                          open_recording(path).cut(1500 * MS, 3000 * MS).cut(900 * MS, 1500 * MS))
+    parts = [Replay(each).explanation.result(job=29)['jobs'][0]['parts']
+             for each in (whole, part, again)]
+    assert parts[1] == parts[2] == parts[0]
+    assert [each['cause'] for each in parts[0]] == ['released late', 'ran long', 'ran']

@@ -7,9 +7,11 @@ import json
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
+from mddag_executor.recording.tables import JobNumbers, RELEASES, rows
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.clocks import offsets
 from mddag_executor.trace import TraceFile
+import numpy as np
 import pytest
 
 from ..report import runs
@@ -361,6 +363,17 @@ def test_processes_of_containers_may_have_the_same_numbers(tmp_path, call):
             for name, use in same[0]['callbacks'].items()} == {
         '/a:tick': (9, 54 * MS), '/b:take': (9, 27 * MS)}
     assert same == apart
+
+
+def test_job_numbers_are_dense():
+    """One fast DAG and many slow ones: joining kept an entry for each DAG and each number."""
+    dag = np.r_[np.zeros(1000), np.repeat(np.arange(1, 100), 2)].astype(np.int32)
+    released = rows(RELEASES, len(dag), dag=dag, job=np.r_[np.arange(1000), np.tile((0, 999), 99)])
+    jobs = JobNumbers(released)
+    assert jobs.none == len(released)
+    assert sorted(jobs.of(released).tolist()) == list(range(len(released)))
+    unknown = np.array([-1, 1, 100, 0]), np.array([0, 998, 0, 1000])
+    assert jobs.of_jobs(*unknown).tolist() == [jobs.none] * 4
 
 
 def test_machines_are_compared_by_way_of_others_and_by_what_is_given():
