@@ -63,6 +63,7 @@ from mddag_executor.executor.jobs import Announced, Jobs, NO_ORIGIN, Origin
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
 from mddag_executor.trace.groups import EXECUTION
+from mddag_executor.trace.schema import GOES_ON
 from msg_graph import TaskSet
 
 if TYPE_CHECKING:
@@ -660,7 +661,7 @@ class Engine:
         core = self._core()
         work.entity.busy_ns += end - start
         if self.record is not None:
-            self._record_run(work, start, end, vtid, worker)
+            self._record_run(work, start, end, vtid, worker, goes_on=True)
         self._let_go(work)
         core.suspend(work.x)
         self._work[work.x] = work
@@ -703,16 +704,22 @@ class Engine:
         self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
         self._decided(now)
 
-    def _record_run(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
+    def _record_run(
+        self, work: Work, start: int, end: int, vtid: int, worker: int, goes_on: bool = False
+    ) -> None:
         """Record the run of an undeclared callback, or of one that goes on later."""
-        self._record_dispatch(work, start, vtid, worker)
+        self._record_dispatch(work, start, vtid, worker, goes_on)
         assert self.record is not None
         self.record('callback_start', start, vtid, work.entity.address, False)
         self.record('callback_end', end, vtid, work.entity.address)
 
-    def _record_dispatch(self, work: Work, time: int, vtid: int, worker: int) -> None:
+    def _record_dispatch(
+        self, work: Work, time: int, vtid: int, worker: int, goes_on: bool = False
+    ) -> None:
         assert self.record is not None
         _, dag, job, vertex = work.origin or NO_ORIGIN
+        if goes_on and dag < 0:     # only this says which pieces are one execution
+            job = GOES_ON
         index, deadline = -1, 0
         if dag >= 0:
             index = self.tables.index_in_dag[vertex]

@@ -16,7 +16,8 @@ Theory of operation
 4. Events come in batches.  Completions of the newest row of a thread wait for the next batch,
    which may have those of other legs.
 5. Rows with the same vertex, job and ready time, up to the completing one, are pieces of one
-   execution, in the order of their starts.
+   execution, in the order of their starts.  Executions of an undeclared callback may have been
+   ready at the same time (in virtual time), so a piece that was suspended says so: ``GOES_ON``.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from mddag_executor.recording.tables import (
     UNKNOWN,
     VERTEX,
 )
+from mddag_executor.trace.schema import GOES_ON
 from msg_graph import TaskSet
 import numpy as np
 
@@ -280,10 +282,12 @@ def _pieces(table: Table) -> None:
         mine = np.flatnonzero(np.isin(vertex, vertex[suspended]))
         keys, some = (_hashed(*(table[name][which] for name in ('vertex', 'job', 'ready')))
                       for which in (mine, suspended))
-        number_pieces(table, mine[np.isin(keys, some)], 'job')
+        mine = mine[np.isin(keys, some)]
+        number_pieces(table, mine, 'job', table['completes'][mine] == NOTHING)
     undeclared = np.flatnonzero(vertex < 0)
     if len(undeclared):
-        number_pieces(table, undeclared, 'callback')
+        number_pieces(table, undeclared, 'callback', table['job'][undeclared] == GOES_ON)
+        table['job'][undeclared] = UNKNOWN
 
 
 def _hashed(vertex: Any, job: Any, ready: Any) -> Ints:
@@ -291,13 +295,17 @@ def _hashed(vertex: Any, job: Any, ready: Any) -> Ints:
     return found
 
 
-def number_pieces(table: Table, mine: Ints, of: str) -> None:
-    """Count pieces among rows; pieces of an execution agree in vertex, ready time and a column."""
+def number_pieces(table: Table, mine: Ints, of: str, goes_on: Mask) -> None:
+    """
+    Count pieces among rows; pieces of an execution agree in vertex, ready time and a column.
+
+    :param goes_on: by row of ``mine`` whether another piece may follow.
+    """
     columns = [table[name][mine] for name in (of, 'vertex', 'ready')]
     order = sort_by(*columns, table['start'][mine])
     mine = mine[order]
     same = np.zeros(len(mine), dtype=np.bool_)
-    same[1:] = table['completes'][mine[:-1]] == NOTHING
+    same[1:] = goes_on[order][:-1]
     for column in columns:
         values = column[order]
         same[1:] &= values[1:] == values[:-1]

@@ -36,6 +36,7 @@ from mddag_executor.recording.tables import (
     Ints,
     LOSSES,
     Mask,
+    NOTHING,
     Recording,
     rows,
     UNKNOWN,
@@ -139,7 +140,8 @@ class UndeclaredRun(ImportedRun):
     def read(self) -> Recording:
         """Return the recording."""
         found = super().read()
-        number_pieces(found.executions, np.arange(len(found.executions)), 'callback')
+        table = found.executions
+        number_pieces(table, np.arange(len(table)), 'callback', table['completes'] == NOTHING)
         found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
         if not found.shut_down:
             found.warnings.append(no_end(self.name))

@@ -16,6 +16,9 @@ import re
 
 from mddag_executor.trace.cdr import FieldType
 
+GOES_ON = -2
+"""Instead of a job, in ``dispatch`` of an undeclared execution that is suspended and goes on."""
+
 PREAMBLE = (('timestamp', 'int64'), ('vpid', 'int32'), ('vtid', 'int32'))
 
 BEFORE_HUMBLE = ('ros2_hook:dds_write', 'ros2_hook:take_type_erased', 'dds:write_pre')

@@ -81,6 +81,29 @@ def test_entities_may_come_and_go_while_recorded(make_executor, make_node, tmp_p
             for row in run.publications} == {('/a:step', '/left'), ('/a:tick', '/right')}
 
 
+def test_an_undeclared_coroutine_is_one_execution_however_often_it_is_resumed(
+        make_executor, tmp_path):
+    path = tmp_path / 'live.mcap'
+    executor = make_executor(loads(GRAPH, 'live.yaml'), trace=str(path))
+    futures = [Future(executor=executor) for _ in range(2)]
+
+    async def wait():
+        for future in futures:
+            await future
+
+    with Spinning(executor):
+        tasks = [executor.create_task(wait) for _ in range(3)]
+        for future in futures:
+            assert wait_for(lambda: is_idle(executor))
+            future.set_result(None)
+        assert wait_for(lambda: all(task.done() for task in tasks) and is_idle(executor))
+    outcome = replay(path)
+    rows = outcome.recording.executions
+    assert outcome.result()['undeclared']['executions'] == 3
+    assert sorted(rows['piece'].tolist()) == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert set(rows['job'].tolist()) == {-1}
+
+
 def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_path):
     """And misses are reported once each; callbacks end just before and after their deadlines."""
     path, misses = tmp_path / 'live.mcap', []

@@ -10,6 +10,7 @@ from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.run import open_recording
 from mddag_executor.report.replays import times_tables
 from mddag_executor.trace import EVENTS, EventType, reading, TraceFile, TraceReader
+from mddag_executor.trace.schema import GOES_ON
 from msg_graph import loads
 import pytest
 
@@ -248,6 +249,18 @@ def test_a_run_killed_in_its_first_callback_which_had_published(trace):
     outcome = replay(trace.path)
     assert outcome.recording.publications[['execution', 'vertex']].tolist() == [(-1, -1)]
     assert outcome.result()['dags']['/camera']['jobs'] == 1
+
+
+def test_undeclared_runs_that_were_ready_at_the_same_time_are_not_one(trace):
+    """In virtual time a callback that publishes three times makes three such runs."""
+    for start in (1, 2, 3):
+        trace.piece(-1, -1, -1, start, start + 1, ready=1)
+    trace.piece(-1, -1, GOES_ON, 11, 12, ready=11)      # a coroutine
+    trace.piece(-1, -1, -1, 13, 14, ready=11)
+    outcome = replay(trace.end(110))
+    assert outcome.result()['undeclared']['executions'] == 4
+    assert outcome.recording.executions['piece'].tolist() == [0, 0, 0, 0, 1]
+    assert outcome.recording.executions['busy'].tolist() == [MS, MS, MS, MS, 2 * MS]
 
 
 def test_a_worker_is_busy_at_most_all_of_the_time(tmp_path, call):
