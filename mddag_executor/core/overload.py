@@ -50,6 +50,8 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
     """
     key = s.x_key[x]
     vertex = s.x_vertex[x]
+    if vertex == t.n_vertices:
+        return demote_undeclared(t, s, x, now)
     demoted = s.demoted[vertex]
     while demoted and (s.x_state[demoted[0][4]] != WAITING
                        or s.x_key[demoted[0][4]][3] != demoted[0][0]):
@@ -74,6 +76,22 @@ def demote(t: Tables, s: State, x: int, now: int) -> bool:
     s.urged[vertex] = s.x_key[first][3]
     _change_key(s, first, key[0])
     return True
+
+
+def demote_undeclared(t: Tables, s: State, x: int, now: int) -> bool:
+    """Demote the first undeclared execution of a queue, once; return whether its key changed."""
+    slot, vertex, queue = s.x_slot[x], s.x_vertex[x], s.x_queue[x]
+    if s.x_started[x] >= 0 or s.job_demoted[slot] >= 0:
+        return False
+    s.job_demoted[slot] = now + LATE_PATIENCE * t.rad_offset[vertex]
+    if queue >= 0:
+        s.queue_late[queue] = 1
+    priority = _priority(
+        t, s, x, s.job_demoted[slot], t.rad_offset[vertex], t.latest_start[vertex])
+    if priority > s.x_key[x][0]:
+        _change_key(s, x, priority)
+        return True
+    return False
 
 
 def _change_key(s: State, x: int, priority: int) -> None:

@@ -55,7 +55,10 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     queue), the next one of its vertex counts as released as early as the dropped one did, until
     one starts.  In a lasting overload (``State.overloaded``) the mean execution times of the older
     ones count, too.  Running executions keep their keys.  Only policies whose keys are times
-    demote.
+    demote.  Of an undeclared callback only the first waiting execution is in the ready queue.  If
+    it is late, past its deadline, it counts as ready ``LATE_PATIENCE`` relative deadlines later,
+    and so does each that follows it until its queue has been empty.  So an overload of undeclared
+    callbacks never makes a declared deadline miss for long, and each gets its turn.
 8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
     Executions that have not started are dropped after an abort.  After an expiry or a failure they
@@ -101,6 +104,7 @@ from heapq import heappop, heappush
 from mddag_executor.core.jobs import (
     close_job,
     deactivate,
+    demotes,
     give_up,
     judge,
     next_deadline,
@@ -108,6 +112,7 @@ from mddag_executor.core.jobs import (
 )
 from mddag_executor.core.overload import (
     demote,
+    demote_undeclared,
     inherit_age,
     late_priority,
     note_late,
@@ -219,12 +224,14 @@ def _outdate(t: Tables, s: State, x: int, now: int) -> None:
 
 
 def ready_undeclared(
-    t: Tables, s: State, key: KeyFunction, job: int, group: int, holds: int, now: int
+    t: Tables, s: State, key: KeyFunction, job: int, group: int, holds: int, queue: int, now: int
 ) -> int:
     """
     Make an undeclared callback ready: it is not judged, and has no job to account for.
 
     :param job: its index, for the key; ``group``, ``holds``: see ``State.x_group``, ``x_holds``.
+    :param queue: the queue of its callback, in which only the first execution can come first; -1:
+        it has none.
     :return: the execution.
     """
     if len(s.undeclared) == 0:
@@ -234,8 +241,45 @@ def ready_undeclared(
     s.x_holds[x] = holds
     order = s.scalars[ORDER] = s.scalars[ORDER] + 1
     s.x_key[x] = key(t, t.n_vertices, now, job, order) + (x,)
+    slot = s.x_slot[x]
+    s.job_demoted[slot] = s.x_queue[x] = -1
+    s.job_hope[slot] = NEVER
+    if demotes(t, s, t.n_dags):
+        s.job_hope[slot] = now
+        s.x_queue[x] = queue
+        if queue >= 0:
+            if s.queue_first[queue] >= 0:
+                s.x_started[x] = -1
+                s.x_state[x] = WAITING
+                heappush(s.queue_rest[queue], (order, 0, 0, 0, x))
+                return x
+            s.queue_first[queue] = x
     _enqueue(t, s, x)
     return x
+
+
+def _leave_queue(t: Tables, s: State, x: int, now: int) -> None:
+    """Let the next undeclared execution of a queue come first; a late queue goes on late."""
+    queue = s.x_queue[x]
+    s.x_queue[x] = -1
+    rest = s.queue_rest[queue]
+    is_first = s.queue_first[queue] == x
+    if is_first:
+        s.queue_first[queue] = -1
+    while rest:
+        after = rest[0][4]
+        is_valid = s.x_queue[after] == queue and s.x_key[after][3] == rest[0][0]
+        if is_valid and not is_first:
+            break
+        heappop(rest)
+        if is_valid:  # else it was dropped
+            is_first = False
+            s.queue_first[queue] = after
+            heappush(s.ready, s.x_key[after])
+            if s.queue_late[queue] != 0:
+                demote_undeclared(t, s, after, now)
+    if s.queue_first[queue] < 0:
+        s.queue_late[queue] = 0
 
 
 def _enqueue(t: Tables, s: State, x: int) -> None:
@@ -263,7 +307,9 @@ def drop(t: Tables, s: State, x: int, now: int) -> None:
     Its entry remains in a queue as stale until it reaches the top or stale entries are the larger
     part.
     """
-    in_queue = s.x_state[x] == WAITING  # a refused execution is in no queue
+    queue = s.x_queue[x]
+    # a refused execution is in no queue, and of undeclared ones only the first
+    in_queue = s.x_state[x] == WAITING and (queue < 0 or s.queue_first[queue] == x)
     pass_on_age(t, s, x, now)
     s.x_state[x] = DROPPED
     slot = s.x_slot[x]
@@ -276,6 +322,8 @@ def drop(t: Tables, s: State, x: int, now: int) -> None:
         s.undeclared.append(x)
     else:
         deactivate(s, slot)
+    if queue >= 0:
+        _leave_queue(t, s, x, now)
     if in_queue:
         add_stale(s)
 
@@ -306,7 +354,7 @@ def peek(t: Tables, s: State, now: int) -> int:
                     heappush(s.group_heap[group], entry)
                 else:
                     wait_for_poll(t, s, entry)
-            elif (vertex < t.n_vertices and now > s.job_hope[s.x_slot[x]] + s.start_by[vertex]
+            elif (now > s.job_hope[s.x_slot[x]] + s.start_by[vertex]
                     and demote(t, s, x, now)):
                 if group >= 0 and s.group_owner[group] == -1:
                     _release_group(s, group)  # others of the group may go first
@@ -367,6 +415,8 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     group = s.x_group[x]
     if group >= 0:
         s.group_owner[group] = x
+    if s.x_queue[x] >= 0:
+        _leave_queue(t, s, x, now)
     return x
 
 

@@ -13,6 +13,7 @@ from mddag_executor.core.policies import policy
 from mddag_executor.core.state import (
     add_group,
     add_slot,
+    add_undeclared_queue,
     as_object,
     Decision,
     empty,
@@ -36,8 +37,8 @@ class Scheduler:
     :param n_workers: size of the bounded pool.
     :param policy_name: a row of ``core.policies``; PolicyError when there is none.
     :ivar ready: ``ready(x, now)`` makes an execution ready.
-    :ivar ready_undeclared: ``ready_undeclared(job, group, holds, now)`` makes an undeclared
-        callback ready, and returns its execution.
+    :ivar ready_undeclared: ``ready_undeclared(job, group, holds, queue, now)`` makes an
+        undeclared callback ready, and returns its execution.
     :ivar take: ``take(worker, now)`` dispatches the next execution on an idle worker and returns
         it; -1: there is none to run.
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
@@ -57,11 +58,12 @@ class Scheduler:
             switch_overhead=0, polling=int(self.policy.polling), urgency=self.policy.urgency)
         self.state = as_object(state)
         self._free_groups: list[int] = []
+        self._free_queues: list[int] = []
         # bound here: a method would be one more call for each execution
         rule = self.tables, self.state
         self.ready: Callable[[int, int], None] = partial(
             rules.make_ready, *rule, self.policy.key)
-        self.ready_undeclared: Callable[[int, int, int, int], int] = partial(
+        self.ready_undeclared: Callable[[int, int, int, int, int], int] = partial(
             rules.ready_undeclared, *rule, self.policy.key)
         self.take: Callable[[int, int], int] = partial(rules.take, *rule)
         self.complete: Callable[[int, int], bool] = partial(
@@ -127,6 +129,14 @@ class Scheduler:
         """Free a group's number, for reuse after its executions have ended."""
         self._free_groups.append(group)
 
+    def new_queue(self) -> int:
+        """Add a queue of an undeclared callback and return its number."""
+        return self._free_queues.pop() if self._free_queues else add_undeclared_queue(self.state)
+
+    def free_queue(self, queue: int) -> None:
+        """Free the number of an empty queue, for reuse."""
+        self._free_queues.append(queue)
+
     def decisions(self) -> list[Decision]:
         """Return and clear the decisions since the last call."""
         taken = self.state.decisions[:]
@@ -138,6 +148,7 @@ class Scheduler:
         """Return the number of executions that wait, for a worker or for their group."""
         waiting = sum(len(heap) for heap in self.state.group_heap)
         waiting += sum(len(queue) for queue in self.state.entity_queue)
+        waiting += sum(len(rest) for rest in self.state.queue_rest)
         waiting += len(self.state.held_back)
         waiting += sum(map(self._is_refused, self.state.group_owner))
         return len(self.state.ready) + waiting - self.state.scalars[N_STALE]

@@ -72,6 +72,11 @@ class State(NamedTuple):
     overtaking: list[int]
     # the executions of undeclared callbacks that may be used again
     undeclared: list[int]
+    # by queue of an undeclared callback: its first waiting execution, or -1; a heap of the others,
+    # by order; whether the first was late since the queue was empty
+    queue_first: list[int]
+    queue_rest: list[list[QueueEntry]]
+    queue_late: list[int]
     # by process, from 1: the least importance that is not demoted, and whether that needs too much
     demoted_below: list[int]
     overloaded: list[int]
@@ -124,6 +129,8 @@ class State(NamedTuple):
     x_state: list[int]
     x_pending: list[int]
     x_group: list[int]
+    # of an undeclared callback: the queue that it waits in, or -1
+    x_queue: list[int]
     # which interpreter it holds while it runs, from 1; 0: none
     x_holds: list[int]
     x_worker: list[int]
@@ -217,8 +224,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
     """
     Add a slot to a DAG, with the region of executions that a job of it needs.
 
-    A slot of the undeclared DAG has one execution, which is used again; its columns of a job never
-    change.
+    A slot of the undeclared DAG has one execution, which is used again.
     """
     slot = len(s.job_dag)
     s.job_dag.append(dag)
@@ -245,6 +251,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_slot.append(slot)
             s.x_vertex.append(vertex)
             s.x_group.append(t.group[vertex])
+            s.x_queue.append(-1)
             s.x_holds.append(0)
             s.x_key.append((0, 0, 0, 0, 0))
             s.x_state.append(IDLE)
@@ -279,6 +286,14 @@ def add_group(s: State) -> int:
     s.group_owner.append(-1)
     add_queue(s.group_heap)
     return len(s.group_owner) - 1
+
+
+def add_undeclared_queue(s: State) -> int:
+    """Add a queue of an undeclared callback and return its number."""
+    s.queue_first.append(-1)
+    add_queue(s.queue_rest)
+    s.queue_late.append(0)
+    return len(s.queue_first) - 1
 
 
 def add_queue(queues: list[list[Any]]) -> None:

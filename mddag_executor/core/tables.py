@@ -260,7 +260,7 @@ class _Columns:
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
             'group': -1, 'process': 1,
-            'period': default_deadline, 'dag_deadline': default_deadline, 'on_late': CONTINUE,
+            'period': default_deadline, 'dag_deadline': default_deadline, 'on_late': self._on_late,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
             'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),
         }

@@ -234,8 +234,10 @@ class Engine:
             if last >= 0:
                 since = max(since, self._state.x_key[last][0] + 1 - self._default_deadline)
         entity.last_since = since
+        if entity.queue < 0:
+            entity.queue = self.scheduler.new_queue()
         x = work.x = self.scheduler.ready_undeclared(
-            entity.ready, entity.group, self._holds(entity), since)
+            entity.ready, entity.group, self._holds(entity), entity.queue, since)
         entity.waiting[x] = None
         self._work[x] = work
 
@@ -420,6 +422,9 @@ class Engine:
         self._core()
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
+        if entity.queue >= 0:
+            self.scheduler.free_queue(entity.queue)
+            entity.queue = -1
 
     # --- dispatch --- ----------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ class Entity:
         'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
         'publishes', 'at_once',
         'habit', 'since', 'gate', 'most_waiting', 'collect_more', 'classify', 'is_nested',
-        '__weakref__')
+        'queue', '__weakref__')
 
     def __init__(
         self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
@@ -53,6 +53,8 @@ class Entity:
         self.node = node
         self.callback = callback
         self.group = group
+        # its queue in the core, if it has run without a job; else -1
+        self.queue = -1
         self.depth = depth
         self.label = label
         self.topic = ''

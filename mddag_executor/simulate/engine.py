@@ -183,7 +183,7 @@ def release_load(
     cost = load.cost_base[dag] + job * load.cost_stride[dag]
     if dag == t.n_dags:
         x = rules.ready_undeclared(
-            t, s, key, job, -1, load.holds[cost] if len(load.holds) > 0 else 0, now)
+            t, s, key, job, -1, load.holds[cost] if len(load.holds) > 0 else 0, -1, now)
         s.job_index[s.x_slot[x]] = job
         s.x_cost[x] = s.x_left[x] = load.costs[cost]
         return

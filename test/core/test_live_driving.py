@@ -160,7 +160,7 @@ class LiveDriver(RuleBasedStateMachine):
         self.counter['undeclared'] += 1
         job = self.tables.n_dags, self.counter['undeclared']
         group = self.groups[group]
-        x = self.scheduler.ready_undeclared(job[1], group, int(holds), self.now)
+        x = self.scheduler.ready_undeclared(job[1], group, int(holds), -1, self.now)
         self.note(Run(x, job, self.tables.n_vertices, 0, group, holds))
 
     def make_ready(self, job, vertex, leg, group, holds):
@@ -443,9 +443,9 @@ TestLiveDriver.settings = examples(200)
 def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits():
     scheduler = live(workers=1)
     first, second = scheduler.new_group(), scheduler.new_group()
-    running = scheduler.ready_undeclared(0, second, 0, 0)
+    running = scheduler.ready_undeclared(0, second, 0, -1, 0)
     scheduler.take(0, 0)
-    waiting = scheduler.ready_undeclared(1, second, 0, 1)
+    waiting = scheduler.ready_undeclared(1, second, 0, -1, 1)
     assert scheduler.take(0, 1) == -1
     scheduler.free_group(second)
     assert scheduler.new_group() not in (first, second), 'its owner runs'
@@ -464,7 +464,7 @@ def test_dropped_executions_leave_the_queues():
         {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us'}]), policy_name='ros2')
     kept = core.source(core.release(0, 0, 0, 0))
     for i in range(3 * SWEEP_AT):
-        core.drop(core.ready_undeclared(i, -1, 0, 0), 0)
+        core.drop(core.ready_undeclared(i, -1, 0, -1, 0), 0)
     core.ready(kept, 1)
     assert core.queue_length == 1
     assert sum(map(len, core.state.entity_queue)) <= SWEEP_AT + 2
@@ -475,12 +475,12 @@ def test_dropped_executions_leave_the_queues():
 
 def test_an_execution_that_gets_an_earlier_key_back_runs_once():
     core = live(workers=1)
-    x = core.ready_undeclared(0, -1, 0, 0)
+    x = core.ready_undeclared(0, -1, 0, -1, 0)
     before = core.state.x_key[x][0]
     for priority in (before + 1, before):
         _change_key(core.state, x, priority)
     for i in range(3 * SWEEP_AT):  # so that stale entries are removed
-        core.drop(core.ready_undeclared(i, -1, 0, 0), 0)
+        core.drop(core.ready_undeclared(i, -1, 0, -1, 0), 0)
     assert core.queue_length == 1 and core.take(0, 1) == x
     core.complete(x, 2)
     assert (core.take(0, 3), core.queue_length) == (-1, 0)

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
 from mddag_executor.core.jobs import source_depth
 from mddag_executor.core.state import N_HOLDING, N_IDLE, N_STALE, WAITING
+from mddag_executor.core.tally import counts
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
@@ -237,6 +238,61 @@ def test_no_queue_starves_a_callback_in_an_overload(depth, keep):
     """The controller takes all the time; a message that is dropped passes its age on."""
     times = Robot(0, depth, keep, others=21).run(20_000 * MS)
     assert max(after - before for before, after in zip(times, times[1:])) <= 1300 * MS
+
+
+def flooded(depths, tick_ms=2, allow_bypass=True):
+    """
+    Run a declared timer of 100 ms, deadline 50 ms, next to a flood of undeclared messages.
+
+    Each message takes 20 ms; every 10 ms one comes, for the callbacks in rotation.  Return the
+    timer's results, and by callback the number and time of the messages that ran.
+    """
+    engine = new_engine(
+        loads(graph(n='name: tick, timer: 100ms, deadline: 50ms')), default_deadline=100 * MS)
+    if allow_bypass:
+        engine.allow_bypass()
+    timer = new_entity(holds=True)
+    timer.source, timer.depth = 0, 2
+    entities = [new_entity(depth=depth, holds=True) for depth in depths]
+    ran, now, ticks, messages = [[] for _ in depths], 0, 0, 0
+    while now < 10_000 * MS:
+        while min(ticks * 10, messages) * 10 * MS <= now:
+            if ticks * 10 <= messages:
+                engine.timer_due(Work(timer, print), ticks * 100 * MS, now)
+                ticks += 1
+            else:
+                entity = entities[messages % len(entities)]
+                engine.ready(Work(entity, print, (messages,)), now)
+                messages += 1
+        work = engine.dispatch(0, now)
+        if work is None:
+            now = min(ticks * 10, messages) * 10 * MS
+            continue
+        start, is_tick = now, work.entity is timer
+        now += (tick_ms if is_tick else 20) * MS
+        if not is_tick:
+            ran[entities.index(work.entity)].append((work.args[0], start))
+        engine.finished(work, start, now, now, 0, 0)
+        engine.validate()
+    return engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick'], ran
+
+
+@pytest.mark.parametrize('allow_bypass', [True, False])
+@pytest.mark.parametrize('depths', [(1,), (10,), (1000,), (10, 10, 1)])
+def test_an_undeclared_overload_takes_no_declared_deadline_down(depths, allow_bypass):
+    tick, ran = flooded(depths, allow_bypass=allow_bypass)
+    assert counts(tick).in_time >= 98  # of 100; at first, all messages can be in time, too
+    assert 480 <= sum(map(len, ran)) <= 500  # all the time that the timer leaves
+    for each in ran:
+        assert [number for number, _ in each] == sorted(number for number, _ in each)
+
+
+@pytest.mark.parametrize('depth', [1, 10, 1000])
+def test_a_declared_overload_does_not_starve_undeclared_callbacks(depth):
+    """They get a turn about once in ten of their deadlines, 100 ms."""
+    _, (ran,) = flooded((depth,), tick_ms=120)
+    times = [0, *(time for _, time in ran), 10_000 * MS]
+    assert max(after - before for before, after in zip(times, times[1:])) <= 1500 * MS
 
 
 def test_the_first_executions_of_a_callback_do_not_count():

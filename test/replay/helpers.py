@@ -284,7 +284,7 @@ class VirtualRun:
 
     def _undeclared(self, now):
         self.undeclared_runs += 1
-        x = self.scheduler.ready_undeclared(self.undeclared_runs, -1, 0, now)
+        x = self.scheduler.ready_undeclared(self.undeclared_runs, -1, 0, -1, now)
         self._waiting[x] = _Execution(x, -1, 0, -1, -1, -1, now)
 
     def _message(self, slot, dag, job, vertex, leg):
