@@ -60,11 +60,11 @@ def _queues(s: State) -> Iterator[str]:
                 stale += 1
             else:
                 found.add(x)
-    for queue, rest in enumerate(s.queue_rest):
-        first = s.queue_first[queue]
+    for number, rest in enumerate(s.queue_rest):
+        first = s.queue_first[number]
         for order, _, _, _, x in rest:
-            if s.x_queue[x] != queue or s.x_key[x][3] != order or first < 0:
-                yield f'execution {x} waits in queue {queue}, the first of which is {first}'
+            if s.x_queue[x] != number or s.x_key[x][3] != order or first < 0:
+                yield f'execution {x} waits in queue {number}, the first of which is {first}'
             found.add(x)
     if stale != s.scalars[N_STALE]:
         yield f'{stale} entries of queues are stale, counted are {s.scalars[N_STALE]}'

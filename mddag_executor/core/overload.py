@@ -123,7 +123,7 @@ def late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
     if first >= 0 and s.overloaded[process] != 0:
         begin += len(s.demoted[vertex]) * s.mean[vertex]
     elif s.x_started[x] >= 0:  # it was preempted
-        begin -= s.x_cost[x] - s.x_left[x]
+        begin -= max(0, s.x_cost[x] - s.x_left[x])  # less than 0: overheads
     yields = _still_gives_way(t, s, vertex, now)
     deadline = NEVER
     start = NEVER

@@ -222,7 +222,7 @@ class BruteForce:
         starts = self.laxity[job.dag.index, vertex.index]
         now = (self.now - job.release) * self.tick
         if execution.has_run:
-            now -= done
+            now -= max(0, done)
         if older is not None and self.is_overloaded:
             now += ahead * mean(vertex)
         within = {sink for sink, start in starts.items() if now <= start}
