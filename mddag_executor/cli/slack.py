@@ -3,6 +3,8 @@
 """
 The verb `slack`: how much longer callbacks may take before a deadline is missed.
 
+If deadlines are missed already, it says how much less they must take.
+
 A recorded run is rescheduled (see `replay --reschedule`), a declaration is simulated (see
 `simulate`), as often as it takes; `mddag_executor.replay.slack` says how.
 """

@@ -1,13 +1,14 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Finds how much longer callbacks may take before another deadline is missed.
+Finds how much longer callbacks may take before a deadline is missed, or how much less they must.
 
 Theory of operation
 -------------------
 The load, recorded or periodic, is scheduled repeatedly, each time with the execution times of one
 callback (or of all) multiplied by a factor.  Bisection finds the greatest factor, to 1 %, with
-which no deadline is missed that is met with factor 1.  Dispatch times are not multiplied.
+which no deadline is missed: above 1 if none is missed with factor 1, otherwise below 1, and 0 if
+even ``LEAST`` is not enough.  Dispatch times are not multiplied.
 
 A run that meets all deadlines takes long; a run with a miss ends early.  So a miss is searched
 again in a *window*: the releases before it, ``WINDOW`` times its deadline or 2, 4, … times as
@@ -18,7 +19,8 @@ window.
 Schedules have anomalies: a longer callback may meet a deadline that a shorter one misses.  So the
 result is a factor below which no tried factor broke.
 
-A sink that misses every deadline with factor 1 is ignored: it cannot get worse.
+Misses that remain if all callbacks together take ``LEAST`` times as long have other reasons (lost
+messages, late releases, dispatch): they are ignored, and so is a sink that has only such misses.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ from msg_graph import TaskSet
 from msg_graph.derive import no_garbage
 import numpy as np
 
-MOST = 100.0
+MOST, LEAST = 100.0, 0.01
 EXACT = 1.01
 WINDOW = 3
 LONG = 4
@@ -94,7 +96,11 @@ class Problem(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The greatest factor (None: nothing broke up to ``MOST``), and the sink that breaks next."""
+    """
+    The greatest factor, and the sink that breaks next.
+
+    A factor of None: nothing broke up to ``MOST``; 0: even ``LEAST`` is not enough.
+    """
 
     factor: float | None
     breaks: int
@@ -114,7 +120,7 @@ class Search:
 
     :param compiled: whether the core runs compiled.
     :ivar missed: by sink the number of missed deadlines with factor 1.
-    :ivar left_out: sinks that miss all of them.
+    :ivar left_out: sinks that miss all of them with any factor.
     """
 
     def __init__(self, problem: Problem, compiled: bool = False) -> None:
@@ -129,17 +135,33 @@ class Search:
         self._windows: list[tuple[int, int]] = []
         decisions = self._decisions(load)
         self.missed = Counter(vertex for kind, _, vertex, *_ in decisions if is_miss(kind))
+        self.left_out: list[int] = []
+        #: Sinks and jobs that miss with any factor.
+        self._known: set[tuple[int, int]] = set()
+        if self.missed:
+            self._leave_out_hopeless_ones()
+        #: The miss to begin with, if there is one with factor 1.
+        self._first = self.miss(ALL, 1.0, worst=True) if self.missed else None
+        self._low, self._high = (1.0, MOST) if self._first is None else (LEAST, 1.0)
+
+    def _leave_out_hopeless_ones(self) -> None:
+        """Ignore misses for which shorter execution times are no remedy."""
+        decisions = self._decisions(self._scaled(ALL, LEAST))
         met = {vertex for kind, _, vertex, *_ in decisions if kind == SINK_IN_TIME}
-        self.left_out = sorted(set(self.missed) - met)
+        self._known = {(vertex, job) for kind, _, vertex, job, *_ in decisions if is_miss(kind)}
+        self.left_out = sorted({vertex for vertex, _ in self._known} - met)
         if self.left_out:
-            deadlines = list(problem.tables.sink_deadline)
+            deadlines = list(self._problem.tables.sink_deadline)
             for sink in self.left_out:
                 deadlines[sink] = _NO_DEADLINE
-            self._problem = problem._replace(
-                tables=problem.tables._replace(sink_deadline=deadlines))
-            decisions = self._decisions(load)
-        #: Sinks and jobs that miss with factor 1.
-        self._known = {(vertex, job) for kind, _, vertex, job, *_ in decisions if is_miss(kind)}
+            self._problem = self._problem._replace(
+                tables=self._problem.tables._replace(sink_deadline=deadlines))
+            self._known = {(vertex, job) for vertex, job in self._known if vertex in met}
+
+    @property
+    def misses(self) -> bool:
+        """Return whether deadlines are missed with factor 1, so that factors are below 1."""
+        return self._first is not None
 
     def _callback_of_cost(self, load: Load, tables: Tables) -> Any:
         """Return by index of a cost its callback; -1: undeclared."""
@@ -208,13 +230,14 @@ class Search:
 
     def factor(self, callback: int) -> Found:
         """Return the greatest factor for a callback, or for ``ALL``."""
-        factor, breaks = MOST, NOTHING
+        factor, breaks = self._high, NOTHING
         for window in list(self._windows):
-            miss = self.miss(callback, factor, window)
+            miss = self.miss(callback, factor, window) if factor > self._low else None
             if miss is not None:
                 factor, breaks = self._bisect(callback, factor, miss.sink, window)
-        while factor > 1.0:     # factor 1 is known to be met
-            miss = self.miss(callback, factor, worst=factor < MOST)
+        while factor > self._low:       # without a miss at its low end
+            miss = self._first if self.misses and factor == self._high else \
+                self.miss(callback, factor, worst=factor < self._high)
             if miss is None:
                 break
             short = self._window(callback, factor, miss)
@@ -235,10 +258,10 @@ class Search:
         return None
 
     def fewer(self, of: str) -> Fewer | None:
-        """Return the minimum of ``workers`` or ``cpus`` for the same result; None: unknown."""
+        """Return the minimum of ``workers`` or ``cpus`` that misses nothing; None: unknown."""
         problem = self._problem
         given = getattr(problem.settings, of)
-        if given is None:
+        if given is None or self.misses:
             return None
         least, miss = given, None
         while least > 1 and miss is None:
@@ -253,8 +276,16 @@ class Search:
     def _bisect(
         self, callback: int, high: float, breaks: int, window: tuple[int, int] | None
     ) -> tuple[float, int]:
-        """Return the greatest factor below one that is not met, and the sink that breaks next."""
-        low = 1.0
+        """
+        Return the greatest factor below one that is not met, and the sink that breaks next.
+
+        The factor is 0 if none is met.
+        """
+        low = self._low
+        if self.misses:
+            miss = self.miss(callback, low, window)
+            if miss is not None:
+                return 0.0, miss.sink
         while high > low * EXACT:
             middle = math.sqrt(low * high)
             miss = self.miss(callback, middle, window)
@@ -271,8 +302,8 @@ class Slack(NamedTuple):
 
     :ivar factors: by callback, and of all together (``ALL``).
     :ivar missed: by sink the number of missed deadlines with factor 1.
-    :ivar left_out: sinks that miss all of them.
-    :ivar fewer: of ``workers`` and ``cpus``; None: their number is unknown.
+    :ivar left_out: sinks that miss all of them with any factor.
+    :ivar fewer: of ``workers`` and ``cpus``; None: unknown, or deadlines are missed.
     """
 
     factors: dict[int, Found]

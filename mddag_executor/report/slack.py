@@ -14,6 +14,7 @@ from mddag_executor.report.tables import percent, short_names, times
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
+_QUESTION = 'How many times as long each callback may take'
 _MARGINS = 'sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'
 
 
@@ -22,10 +23,11 @@ def lines(result: Mapping[str, Any]) -> Iterator[str]:
     short = _short(result)
     yield from _missed_lines(result)
     yield from _load_lines(result)
-    yield '\nHow many times as long each callback may take, if the others take as long as now:'
-    yield table(('callback', 'may take', 'then misses'), [
-        [short[name], _times(one['factor']), short[one['breaks']]]
-        for name, one in _tightest(result)])
+    rows = [[short[name], _times(one['factor']), short[one['breaks']]]
+            for name, one in _tightest(result)]
+    if rows:
+        yield f'\n{_QUESTION}, if the others take as long as now:'
+        yield table(('callback', 'may take', 'then misses'), rows)
     yield 'How long before their deadlines the sinks complete now:'
     yield table(_MARGINS, [
         [short[name], *_margins(sink)] for name, sink in _least_first(result)])
@@ -48,10 +50,12 @@ def _margins(sink: Mapping[str, Any]) -> list[Cell]:
 
 def _missed_lines(result: Mapping[str, Any]) -> Iterator[str]:
     missed = result['missed']
-    if missed and _is_judged(result):
-        yield (f'{counted(sum(missed.values()), "deadline")} missed already: '
-               + listed([f'{name} ({n})' for name, n in missed.items()])
-               + '; what follows says when another one is missed')
+    if missed:
+        yield (f'{counted(sum(missed.values()), "deadline")} missed: '
+               + listed([f'{name} ({n})' for name, n in missed.items()]))
+    if result['left_out']:
+        yield ('left out, because shorter execution times are no remedy: '
+               + listed(result['left_out']))
 
 
 def _summary(result: Mapping[str, Any]) -> Iterator[str]:
@@ -61,8 +65,12 @@ def _summary(result: Mapping[str, Any]) -> Iterator[str]:
         yield f'never completed, so not judged: {counted(len(never), "sink")}: {listed(never)}'
     if not _is_judged(result):
         if len(never) < len(result['sinks']):
-            yield ('every sink misses every deadline already, so nothing is left to find')
+            yield 'every sink misses every deadline, whatever the callbacks take'
         return
+    useless = sum(one['factor'] == 0 for one in result['callbacks'].values())
+    if useless:
+        yield (f'{counted(useless, "callback")}: deadlines are missed however little one alone '
+               'takes')
     free = sum(one['factor'] is None for one in result['callbacks'].values())
     most = result['most']
     if free:
@@ -76,6 +84,8 @@ def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
     load, most = result['load'], result['most']
     yield 'the load as a whole: ' + (
         f'{most:g} times and more' if load['factor'] is None else
+        f'it must be less than {1 / most:g} times; {printable(load["breaks"])} misses'
+        if load['factor'] == 0 else
         f'{_times(load["factor"])}, then {printable(load["breaks"])} misses')
     each = ' in each process' if result['processes'] > 1 else ''
     for of, name in (('workers', 'worker'), ('cpus', 'CPU')):
@@ -83,8 +93,7 @@ def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
         if fewer is not None:
             of_each = each if of == 'workers' else ''
             some = f'{fewer["least"]} of {counted(fewer["given"], name)}{of_each}'
-            yield (f'with {some} no further deadline is missed' if result['missed'] else
-                   f'{some} {"is" if fewer["least"] == 1 else "are"} enough') + (
+            yield f'{some} {"is" if fewer["least"] == 1 else "are"} enough' + (
                 '' if fewer['breaks'] is None else
                 f'; with one less {printable(fewer["breaks"])} misses')
 
@@ -96,7 +105,7 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
     for line in (*_missed_lines(result), *_load_lines(result), *_summary(result)):
         yield f'<p class="note">{escape(line)}</p>\n'
     short = _short(result)
-    yield ('<h2>How many times as long each callback may take</h2>\n<p class="note">If the others '
+    yield (f'<h2>{_QUESTION}</h2>\n<p class="note">If the others '
            f'take as long as now. The bars are logarithmic, up to {result["most"]:g} times.</p>\n')
     yield '<div class="wide">' + html_table(('callback', 'then misses', 'may take'), [
         (short[name], short[one['breaks']], _bar(one['factor'], result['most']))
@@ -113,7 +122,7 @@ def _short(result: Mapping[str, Any]) -> dict[str, str]:
 
 def _tightest(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return sorted(((name, one) for name, one in result['callbacks'].items()
-                   if one['factor'] is not None), key=lambda item: item[1]['factor'])
+                   if one['factor']), key=lambda item: item[1]['factor'])
 
 
 def _least_first(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -132,4 +141,4 @@ def _times(factor: float) -> str:
 
 def _bar(factor: float, most: float) -> Html:
     kind = 'missed' if factor < 1.1 else 'least' if factor < 1.5 else 'most'
-    return bar(math.log(factor) / math.log(most), kind, _times(factor))
+    return bar(max(0.0, math.log(factor) / math.log(most)), kind, _times(factor))
