@@ -56,7 +56,7 @@ def main(args: argparse.Namespace) -> int:
     status = verdicts.judge(args, result)
     if args.report is not None:
         from mddag_executor.report.html import of_outcome
-        common.write_report(args.report, of_outcome(outcome))
+        common.write_report(args.report, of_outcome(outcome, result))
     common.show(args, result, _lines(args, result))
     return status
 

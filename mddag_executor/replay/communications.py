@@ -13,11 +13,12 @@ import numpy as np
 
 def recorded_callbacks(recording: Recording) -> dict[str, dict[str, int]]:
     """Return counts and times (ns) of each recorded callback that ran."""
-    table, found = recording.executions, {}
-    for number in np.unique(table['callback']).tolist():
-        mine = table[table['callback'] == number]
-        ended = mine[mine['end'] >= 0]
-        took = ended['end'] - ended['start']
+    start, end = (recording.executions[name] for name in ('start', 'end'))
+    numbers, index = different(recording.executions['callback'])
+    found = {}
+    for number, mine in zip(numbers.tolist(), rows_by(index, len(numbers))):
+        ended = mine[end[mine] >= 0]
+        took = end[ended] - start[ended]
         found[recording.who.name(number), number] = {
             'executions': len(took), 'unfinished': len(mine) - len(took),
             'busy_ns': sum_of(took), 'shortest_ns': int(took.min()) if len(took) else 0,

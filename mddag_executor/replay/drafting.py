@@ -31,7 +31,7 @@ from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
 from mddag_executor.recording.entities import Callback, KINDS
 from mddag_executor.recording.head import is_declared, named_errors, read_head
-from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by, VERTEX
+from mddag_executor.recording.tables import Ints, Mask, Recording, rows_by, sort_by, VERTEX
 from mddag_executor.replay.run import open_recording
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
@@ -94,8 +94,8 @@ class System:
         self._declared: dict[int, Declared] = {
             number: recording.task_set.vertices[vertex].callback for number, vertex in zip(
                 numbers.tolist(), recording.vertices_of_callbacks().tolist()) if vertex >= 0}
-        self._runs = {number: _runs_of(recording, index == place)
-                      for place, number in enumerate(numbers.tolist())}
+        self._runs = {number: _runs_of(recording, chosen) for number, chosen in zip(
+            numbers.tolist(), rows_by(index, len(numbers)))}
         self._find_publishers(recording)
 
     def _find_publishers(self, recording: Recording) -> None:
@@ -244,7 +244,7 @@ class System:
         return count
 
 
-def _runs_of(recording: Recording, which: Mask) -> Runs:
+def _runs_of(recording: Recording, which: Ints) -> Runs:
     """Return the executions of a callback: the chosen rows."""
     table = recording.executions[which]
     table = table[table['start'] >= 0]

@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Set
 
 from mddag_executor.recording.mapping import declared_keys
-from mddag_executor.recording.tables import different, Recording, VERTEX
+from mddag_executor.recording.tables import different, Recording, rows_by, VERTEX
 from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
@@ -31,8 +31,8 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     vertices = judge.vertices
     releases: dict[str, Releases] = {}
     released, since = recording.releases, (recording.start or 0) + skip
-    for dag in judge.dags:
-        mine = released['release'][released['dag'] == dag.index]
+    for dag, chosen in zip(judge.dags, rows_by(released['dag'], len(judge.dags))):
+        mine = released['release'][chosen]
         mine = mine[mine >= since]
         if len(mine):
             of = releases[dag.vertices[dag.source].callback.key] = Releases()

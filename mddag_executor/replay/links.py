@@ -346,9 +346,10 @@ class Links:
         return found
 
     def _count_partial(self, only_rcl: Ints, by_both: Ints) -> None:
-        for number in np.intersect1d(only_rcl, by_both[by_both >= 0]).tolist():
-            self.losses.count('partial', self.publishers[number].topic,
-                              int((only_rcl == number).sum()))
+        numbers, counts = np.unique(
+            only_rcl[np.isin(only_rcl, by_both[by_both >= 0])], return_counts=True)
+        for number, count in zip(numbers.tolist(), counts.tolist()):
+            self.losses.count('partial', self.publishers[number].topic, count)
 
     def _numbers(self, topics: Iterable[str]) -> Ints:
         """Return the numbers of topics; ``len(self.topics)``: without publisher."""

@@ -39,6 +39,7 @@ from mddag_executor.recording.tables import (
     NOTHING,
     Recording,
     rows,
+    rows_by,
     UNKNOWN,
 )
 from mddag_executor.replay.imported_events import (
@@ -63,6 +64,41 @@ _UNSENT = 256               # publications of a topic without a timestamp that a
 _SOON_NS, _SOON_PART = 1_000_000, 10
 
 
+class _Sent:
+    """
+    The publications of a topic in the order of time.
+
+    :ivar rows: of the messages.
+    :ivar stamps: their source timestamps; 0: unknown.
+    """
+
+    def __init__(self, rows: Ints, times: list[int], ends: list[int]) -> None:
+        self.rows = rows
+        self.stamps = [0] * len(times)
+        self._times, self._ends = times, ends
+        #: By publication the last one before it that was being sent longer, or -1.
+        self._longer: list[int] = []
+        for place, end in enumerate(ends):
+            before = place - 1
+            while before >= 0 and ends[before] <= end:
+                before = self._longer[before]
+            self._longer.append(before)
+
+    def being_sent(self, stamp: int) -> list[int]:
+        """Return the publications without timestamp that were being sent at a time."""
+        last = bisect_right(self._times, stamp + _ROUNDING_NS)
+        least, begun = last - _UNSENT, stamp - _ROUNDING_NS
+        fits, place = [], last - 1
+        while place >= max(0, least):
+            if self._ends[place] < begun:
+                place = self._longer[place]     # all between them had ended before
+                continue
+            if not self.stamps[place]:
+                fits.append(place)
+            place -= 1
+        return fits
+
+
 class _OwnLinks(Links):
     """The executions and messages of this executor (rules 1 and 2)."""
 
@@ -79,8 +115,8 @@ class _OwnLinks(Links):
         at = np.flatnonzero(stops)
         mine = (before >= 0) & sent[before]
         ends[self._row[before[mine]]] = table['time'][at[mine]]
-        rows_of = [np.flatnonzero(self.topic_of == topic) for topic in range(len(self.topics) + 1)]
-        published = [(mine.tolist(), found['time'][mine].tolist()) for mine in rows_of]
+        published = [_Sent(rows, found['time'][rows].tolist(), ends[rows].tolist())
+                     for rows in rows_by(self.topic_of, len(self.topics) + 1)]
         takes = np.flatnonzero((kind == TAKE) & (self._subscription >= 0))
         topics = self._numbers(each[0].start for each in self.taken)[self._subscription[takes]]
         known: set[tuple[int, int]] = set()
@@ -88,16 +124,15 @@ class _OwnLinks(Links):
         for topic, stamp in zip(topics.tolist(), table['b'][takes].tolist()):
             if (topic, stamp) in known:
                 continue
-            rows, times = published[topic]
-            last = bisect_right(times, stamp + _ROUNDING_NS)
-            fits = [row for row in rows[max(0, last - _UNSENT):last]
-                    if not found['stamp'][row] and stamp <= ends[row] + _ROUNDING_NS]
+            fits = published[topic].being_sent(stamp)
             if fits:
                 known.add((topic, stamp))
             if len(fits) == 1:
-                found['stamp'][fits[0]] = stamp
+                published[topic].stamps[fits[0]] = stamp
             elif fits:
                 several.append((topic, stamp))
+        for sent_on in published:
+            found['stamp'][sent_on.rows] = sent_on.stamps
         return np.array(several, dtype=np.int64).reshape(-1, 2)
 
     def _takes(self) -> tuple[Ints, Ints]:
@@ -111,10 +146,17 @@ class _OwnLinks(Links):
         takes, ready = kind == TAKE, kind == READY
         #: By event of a dispatch the event of the taken message, or -1.
         self._taken_at = np.full(len(table), -1)
-        for number, callback in enumerate(self.callbacks):
-            subscriptions = [i for i, each in enumerate(self.taken) if callback in each]
-            mine = np.flatnonzero(takes & np.isin(self._subscription, subscriptions))
-            these = np.flatnonzero(ready & (self._callback == number)) if len(mine) else mine
+        taken, dispatched = np.flatnonzero(takes), np.flatnonzero(ready)
+        takes_by = rows_by(self._subscription[taken], len(self.taken))
+        ready_by = rows_by(self._callback[dispatched], len(self.callbacks))
+        subscriptions: dict[int, list[int]] = {}
+        for number, callbacks in enumerate(self.taken):
+            for one in {id(callback) for callback in callbacks}:
+                subscriptions.setdefault(one, []).append(number)
+        for callback, those in zip(self.callbacks, ready_by):
+            mine = np.sort(np.concatenate([taken[:0], *(
+                taken[takes_by[each]] for each in subscriptions.get(id(callback), ()))]))
+            these = dispatched[those] if len(mine) else mine
             place = np.searchsorted(time[mine], table['b'][these], 'right') - 1
             these, place = these[place >= 0], place[place >= 0]
             # a message starts one execution; its pieces have the same ready time
@@ -173,8 +215,9 @@ class UndeclaredRun(ImportedRun):
 
     def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
         number, ready = self.links.runs['callback'], self.links.runs['ready'].copy()
-        for each, callback in enumerate(self.links.callbacks):
-            times = np.unique(ready[number == each])
+        for callback, mine in zip(
+                self.links.callbacks, rows_by(number, len(self.links.callbacks))):
+            times = np.unique(ready[mine])
             if callback.kind == 'timer' and len(times):
                 callback.grid = _grid(times, callback.period)
         # the time at which a request was taken is not recorded

@@ -47,9 +47,15 @@ _KEYS = (('n, p', 'next and previous miss'), ('Left, Right', 'move'), ('+, -', '
          ('0', 'the whole run'))
 
 
-def of_outcome(outcome: Replay | Reschedule) -> ReportData:
-    """Return the data of a report about a recorded run."""
-    result = outcome.result()
+def of_outcome(
+    outcome: Replay | Reschedule, result: Mapping[str, Any] | None = None
+) -> ReportData:
+    """
+    Return the data of a report about a recorded run.
+
+    :param result: of the outcome, if it is known already.
+    """
+    result = outcome.result() if result is None else result
     trace = result['recording']['trace']
     if isinstance(outcome, Replay):
         return _data(

@@ -2,8 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Jobs, verdicts and waits of imported recordings; a hand-made one that needs no CARET files."""
 
+from types import SimpleNamespace
+
+from mddag_executor.recording.tables import EXECUTIONS, rows, UNKNOWN
 from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.replay.communications import recorded_callbacks
 from msg_graph import loads
+import numpy as np
 import pytest
 
 from .recorded import BEGIN, CAMERA, MS, Recorded, US
@@ -327,3 +332,27 @@ def test_releases_of_messages(tmp_path, release_from, stated, response, said):
     assert [line for line in warnings if 'the next best stamp' in line] == ([
         '1 release by the next best stamp, because the declared one is not recorded or years '
         'away: /n:s (header_stamp)'] if said else [])
+
+
+class Counted(np.ndarray):
+    """A table that counts the rows that are read of it."""
+
+    rows = 0
+
+    def __getitem__(self, key):
+        found = super().__getitem__(key)
+        Counted.rows += found.size
+        return found
+
+
+def test_callbacks_are_summed_up_in_one_pass():
+    number = np.arange(1_000) % 200
+    table = rows(EXECUTIONS, 1_000, callback=number, start=1_000, end=np.where(
+        np.arange(1_000) < 10, UNKNOWN, 1_000 + number)).view(Counted)
+    Counted.rows = 0
+    found = recorded_callbacks(SimpleNamespace(
+        executions=table, who=SimpleNamespace(name='c{:03}'.format)))
+    assert Counted.rows < 20 * len(table)
+    assert list(found) == [f'c{n:03}' for n in range(200)]
+    assert found['c007'] == {'executions': 4, 'unfinished': 1, 'busy_ns': 28, 'shortest_ns': 7,
+                             'longest_ns': 7}

@@ -2,8 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Traces that were recorded without a declaration, judged by one that is given later."""
 
+import bisect
+import itertools
 from pathlib import Path
 
+from hypothesis import given
+from hypothesis import strategies as st
+from mddag_executor.replay import undeclared_run
 from mddag_executor.trace import EVENTS, TraceFile, TraceReader
 import pytest
 
@@ -221,3 +226,41 @@ def test_a_job_that_is_open_at_the_end_is_judged_by_that(run):
     assert (sink['completed'], sink['late'], sink['overdue']) == (0, 1, 1)
     assert result['dropped'] == {'qos_depth': 1}
     assert result['misses']['causes']['dropped'] == 1
+
+
+class Counted(list):
+    """A list that counts how often an item is read."""
+
+    reads = 0
+
+    def __getitem__(self, key):
+        Counted.reads += 1
+        return super().__getitem__(key)
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 60)), max_size=40), st.data())
+def test_publications_that_were_being_sent_are_found(sent, data):
+    """As by comparing all of the last ones."""
+    module = undeclared_run
+    rounding, most = module._ROUNDING_NS, module._UNSENT
+    times = [rounding * each for each in itertools.accumulate(gap for gap, _ in sent)]
+    ends = [time + rounding * took for time, (_, took) in zip(times, sent)]
+    topic = module._Sent(None, times, ends)
+    topic.stamps = data.draw(st.lists(st.sampled_from((0, 1)), min_size=len(sent),
+                                      max_size=len(sent)))
+    stamp = data.draw(st.integers(0, 400 * rounding))
+    last = bisect.bisect_right(times, stamp + rounding)
+    assert sorted(topic.being_sent(stamp)) == [
+        place for place in range(max(0, last - most), last)
+        if not topic.stamps[place] and stamp <= ends[place] + rounding]
+
+
+def test_a_message_is_not_compared_with_all_publications():
+    """Not even if one of them, of a thread that was killed, has no end."""
+    times = [100_000 * n for n in range(1_000)]
+    topic = undeclared_run._Sent(None, times, Counted(
+        [2 ** 62 if n == 500 else time + 50_000 for n, time in enumerate(times)]))
+    Counted.reads = 0
+    for place, time in enumerate(times):
+        assert topic.being_sent(time + 20_000) == [place, *[500] * (500 < place < 756)]
+    assert Counted.reads < 5 * len(times)

@@ -11,7 +11,9 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE
-from mddag_executor.replay import replay
+from mddag_executor.replay import Replay, replay
+from mddag_executor.replay.deadlines import Judged
+from mddag_executor.replay.paths import Paths
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import html
 from mddag_executor.report.diff import callbacks_table, compare, sinks_table
@@ -252,3 +254,14 @@ def test_what_only_one_run_has(result, tmp_path):
     difference = compare(lacking, result)
     assert 'only in B' in sinks_table(difference['dags']) and not difference['worse']
     assert 'driver:tick' in callbacks_table(difference)
+
+
+def test_a_report_computes_nothing_twice(tmp_path, call, monkeypatch):
+    calls = []
+    for owner, name in ((Replay, 'result'), (Paths, 'results'), (Judged, '__init__')):
+        method = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *args, method=method, **options: (
+            calls.append(method), method(*args, **options))[1])
+    done = call('replay', runs.by_hand(tmp_path / 'run.mcap'), '--json', tmp_path / 'a.json',
+                '--report', tmp_path / 'r.html')
+    assert done.returncode == 0 and len(calls) == len(set(calls)) == 3
