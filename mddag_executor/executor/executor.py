@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 import gc
+import math
 import os
 import select
 import threading
@@ -74,6 +75,9 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from typing_extensions import Self
 
+LONGEST_WAIT_S = 3600.0
+"""One wait of the spinning thread: system calls refuse times beyond 24 days."""
+
 SETTLE_S = 0.1
 """How long to check whether the callback that completed a future has ended."""
 
@@ -82,11 +86,13 @@ def deadline_of(timeout_sec: float | None) -> float | None:
     """
     Return the monotonic time (s) at which a timeout expires; None: never.
 
-    :param timeout_sec: seconds; None or negative: for ever.
-    :raises TypeError: when it is not a number.
+    :param timeout_sec: seconds; None, negative or above ``TIMEOUT_MAX`` (292 years): for ever.
+    :raises TypeError: when it is not a number; ``ValueError``: when it is NaN.
     """
-    if timeout_sec is None or timeout_sec < 0:
+    if timeout_sec is None or timeout_sec < 0 or timeout_sec >= threading.TIMEOUT_MAX:
         return None
+    if math.isnan(timeout_sec):
+        raise ValueError('timeout_sec is NaN: it must be a number of seconds, or None')
     return time.monotonic() + timeout_sec
 
 
@@ -471,12 +477,12 @@ class MultiDeadlineExecutor(BareExecutor):
                 each.start()
 
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
-        """Return for how long the spinning thread may wait; None: until a wake-up."""
+        """Return for how long the spinning thread waits at most; None: until a wake-up."""
         now = time.monotonic()
         times = [rest, self._unclaimed.rest_s(), self._names.rest_s()]
         times += [at - now for at in self._check_at if at > now]
         if deadline is not None:
-            times.append(max(0.0, deadline - now))
+            times.append(min(max(0.0, deadline - now), LONGEST_WAIT_S))
         return min((each for each in times if each is not None), default=None)
 
     def _settle(
@@ -547,7 +553,12 @@ class MultiDeadlineExecutor(BareExecutor):
 
         thread = threading.Thread(target=serve, name='mddag-serve-meanwhile', daemon=True)
         self._pool.start()
-        thread.start()
+        try:
+            thread.start()
+        except BaseException:  # too many threads
+            self._pool.pause()
+            self._pool.resume_stepping()
+            raise
         try:
             yield
         finally:
@@ -652,7 +663,7 @@ class MultiDeadlineExecutor(BareExecutor):
         :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
         :return: whether all have finished.
         """
-        if timeout_sec is not None and timeout_sec < 0:
+        if timeout_sec is not None and not 0 <= timeout_sec < threading.TIMEOUT_MAX:
             timeout_sec = None
         self.begin_end()
         self._must_shut_down = self._pool.is_inside()

@@ -55,8 +55,10 @@ class LocalDelivery:
     def hold(self) -> None:
         """Pause announcements, if they would wake a thread that waits in the epoll."""
         if self._pool.polling:
-            self._pool.loop.hold(self.sources)
-            self._is_held = True  # set last: a thread that ends it meanwhile may be too early
+            try:
+                self._pool.loop.hold(self.sources)
+            finally:
+                self._is_held = True  # last: a thread that ends it meanwhile may be too early
 
     def listen_again(self, subscription: Any) -> None:
         """Announce a subscription again after the middleware has replaced its reader."""
@@ -156,9 +158,9 @@ def install() -> None:
                 _send(send, self, msg, state)
             return
         publication = None
-        for delivery in deliveries:
-            delivery.hold()
-        try:
+        try:  # an interrupt at any place must not leave the descriptors switched off
+            for delivery in deliveries:
+                delivery.hold()
             publication = _send(send, self, msg, state)
         finally:
             for delivery in deliveries:

@@ -103,11 +103,13 @@ class GuestExecutor:
                 raised.append(self._errors.popleft())
             return bool(raised) or self._is_stopped or until()
 
+        timeout_s = getattr(timeout_sec, 'timeout', timeout_sec)
+        if timeout_s is not None:
+            timeout_s = min(timeout_s, threading.TIMEOUT_MAX)
         with self._changed:
             self._n_spinning += 1
         try:
-            self.host.wait(
-                self._changed, is_over, getattr(timeout_sec, 'timeout', timeout_sec), self.guest)
+            self.host.wait(self._changed, is_over, timeout_s, self.guest)
         finally:
             with self._changed:
                 self._n_spinning -= 1

@@ -4,6 +4,7 @@
 
 import contextlib
 import itertools
+import math
 import signal
 import sys
 import threading
@@ -69,6 +70,21 @@ def test_an_exception_comes_out_of_spin(make_executor, make_node, kind):
         executor.create_task(fail if kind == 'task' else fail_later)
     with pytest.raises(ZeroDivisionError, match=kind):
         executor.spin_until_future_complete(after, 5.0)
+
+
+@pytest.mark.parametrize('seconds', [1e7, 1e300, math.inf])
+def test_a_timeout_may_be_as_long_as_you_like(make_executor, seconds):
+    """Also longer than a system call accepts."""
+    executor = make_executor()
+    future = Future(executor=executor)
+    threading.Timer(0.05, executor.create_task, (future.set_result, 1)).start()
+    executor.spin_until_future_complete(future, seconds)
+    assert future.done()
+    threading.Timer(0.05, executor.create_task, (len, ())).start()
+    executor.spin_once(seconds)
+    with pytest.raises(ValueError, match='NaN'):
+        executor.spin_once(math.nan)
+    assert executor.shutdown(seconds)
 
 
 def test_spinning_twice_is_an_error(make_executor):
