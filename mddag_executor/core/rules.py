@@ -22,13 +22,14 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     by the *order*, a running number given when an execution becomes ready or is put back.  At one
     instant, as in the paper's own program, completions come first, by worker, and of each its
     successors in reverse order of its edges; then releases, by DAG; then, during dispatch,
-    preempted executions.
+    preempted executions.  An execution that goes on after it has waited (*resumes*) becomes ready
+    again: it keeps the key of its job, but an undeclared one counts from then on.
 4.  **Callback groups.**  A group has at most one owner, from its first dispatch to its completion
     (also while preempted or suspended).  An execution that comes first while its group is busy is
     set aside in the group's heap; when the owner completes, the group's smallest returns.  A
     user-defined group lets executions run one by one: if the owner may begin, it leaves the group
     for good (``leave_group``); if not, it waits as the owner, so that no other one overtakes it
-    (``refuse``, then ``resume``).
+    (``refuse``, then ``ask_again``).
 5.  **Workers.**  A fresh execution goes to the idle worker with the lowest number (``schedule``),
     or to the worker that asks (``take``: live, cache-warm).  If no worker is idle and preemption
     is on, the running execution with the largest priority (ties: the highest worker number) is put
@@ -80,7 +81,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     (``State.held_back``), and others overtake it.  If it is more urgent than all holders, it
     starts, unless the driver forbids it for the moment (``State.overtaking``, from
     ``queues.overtaking_pays``: the wait is short).  An execution that lends its worker, is
-    suspended or turns out to wait (``stop_holding``) holds it no more.
+    suspended or turns out to wait (``stop_holding``) holds it no more, and needs it and a worker
+    again when it resumes.
 12. **Several processes in virtual time.**  One state can represent all processes of a run
     (``state.divide``).  Each has its own workers and interpreter, for which rules 5 and 11 hold
     separately; an execution without an idle worker in its process is deferred.  There is no
@@ -500,10 +502,32 @@ def leave_group(s: State, x: int) -> None:
     _release_group(s, group)
 
 
-def resume(s: State, x: int) -> None:
-    """Put a suspended or refused execution back into the ready queue, with the same key."""
+def ask_again(s: State, x: int) -> None:
+    """Put a refused execution back into the ready queue: it waits with the same key (rule 4)."""
     s.x_state[x] = WAITING
     heappush(s.ready, s.x_key[x])
+
+
+def resume(
+    t: Tables, s: State, key: KeyFunction, x: int, job: int, holds: int, now: int
+) -> None:
+    """
+    Put a suspended execution, or one that has lent its worker, back into the ready queue (rule 3).
+
+    :param job: its index, for the key of an undeclared one; ``holds``: see ``State.x_holds``.
+    """
+    if s.x_vertex[x] == t.n_vertices:
+        order = s.scalars[ORDER] = s.scalars[ORDER] + 1
+        s.x_key[x] = key(t, t.n_vertices, now, job, order) + (x,)
+    s.x_holds[x] = holds
+    s.x_state[x] = WAITING
+    heappush(s.ready, s.x_key[x])
+
+
+def go_on_without(s: State, x: int) -> None:
+    """Let a waiting execution that has run before go on without worker and interpreter."""
+    s.x_state[x] = RUNNING
+    add_stale(s)
 
 
 # --- completion ----------------------------------------------------------------------------------

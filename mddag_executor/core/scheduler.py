@@ -44,8 +44,10 @@ class Scheduler:
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
         did not complete its vertex.
     :ivar fail: ``fail(x, now)`` ends a failed execution; see ``complete``.
+    :ivar resume: ``resume(x, job, holds, now)`` makes a suspended execution, or one that has lent
+        its worker, ready to go on.
 
-    Functions without own logic here (``drop``, ``lend``, ``resume``, …) are bound unchanged: see
+    Functions without own logic here (``drop``, ``lend``, ``refuse``, …) are bound unchanged: see
     ``core.rules`` and ``core.jobs``.
     """
 
@@ -70,10 +72,13 @@ class Scheduler:
             rules.complete, *rule, self.policy.key)
         self.fail: Callable[[int, int], bool] = partial(rules.fail, *rule, self.policy.key)
         self.drop: Callable[[int, int], None] = partial(rules.drop, *rule)
-        self.lend, self.stop_holding, self.suspend, self.refuse, self.leave_group, self.resume = (
+        self.lend, self.stop_holding, self.suspend, self.refuse, self.leave_group = (
             partial(function, self.state) for function in (
-                rules.lend, rules.stop_holding, rules.suspend, rules.refuse, rules.leave_group,
-                rules.resume))
+                rules.lend, rules.stop_holding, rules.suspend, rules.refuse, rules.leave_group))
+        self.ask_again: Callable[[int], None] = partial(rules.ask_again, self.state)
+        self.go_on_without: Callable[[int], None] = partial(rules.go_on_without, self.state)
+        self.resume: Callable[[int, int, int, int], None] = partial(
+            rules.resume, *rule, self.policy.key)
         self.finish: Callable[[int], None] = partial(jobs.finish, *rule)
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:

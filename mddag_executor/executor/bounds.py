@@ -42,6 +42,13 @@ So a coroutine that yields a few times loses nothing, and one that polls does no
 time.
 """
 
+REJOIN_NS = 100_000_000
+"""
+How long a callback waits for its worker after ``Client.call`` before it checks what keeps it.
+
+If nothing has ended and nothing has computed meanwhile, it goes on without a worker.
+"""
+
 END_S = 1.0
 """How long the end waits for a thread that was asked to end; it usually takes less than 1 ms."""
 

@@ -595,10 +595,24 @@ class Engine:
         self._let_go(work)
         core.lend(work.x)
 
-    def resume(self, work: Work) -> None:
+    def resume(self, work: Work, now: int) -> None:
         """Make a suspended execution ready again; does nothing if it is not suspended."""
         if work.x >= 0 and self._state.x_state[work.x] == SUSPENDED:
-            self._core().resume(work.x)
+            self._resume(work, now)
+
+    def _resume(self, work: Work, now: int) -> None:
+        entity = work.entity
+        self._core().resume(work.x, entity.ready, entity.habit.holds, now)
+
+    def rejoin(self, work: Work, now: int) -> None:
+        """Make an execution that has lent its worker ready to go on: ``dispatch`` returns it."""
+        self._work[work.x] = work
+        self._resume(work, now)
+
+    def go_on_without(self, work: Work) -> None:
+        """Let an execution go on that waits for a worker after ``rejoin``, without one."""
+        del self._work[work.x]
+        self._core().go_on_without(work.x)
 
     def leave_group(self, work: Work) -> None:
         """Note that an execution's callback group has let it run (see ``work``)."""
@@ -610,7 +624,7 @@ class Engine:
         for entity in refused:
             x = next(iter(entity.waiting), -1)
             if x >= 0 and self._state.x_state[x] == SUSPENDED:
-                self.scheduler.resume(x)
+                self.scheduler.ask_again(x)
 
     # --- ends of executions --- ------------------------------------------------------------------
 

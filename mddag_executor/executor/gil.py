@@ -40,7 +40,13 @@ import os
 from resource import getrusage, RUSAGE_THREAD
 import sys
 import threading
-from time import clock_gettime_ns, process_time_ns, pthread_getcpuclockid, thread_time_ns
+from time import (
+    clock_gettime_ns,
+    monotonic_ns,
+    process_time_ns,
+    pthread_getcpuclockid,
+    thread_time_ns,
+)
 from typing import NamedTuple
 
 from mddag_executor.core import NEVER
@@ -170,33 +176,47 @@ class GilHabit:
 
 
 class Measurement:
-    """The CPU times during an execution; they update the ``habit`` at the end, unless it rests."""
+    """
+    The CPU times during an execution; they update the ``habit`` at the end, unless it rests.
 
-    __slots__ = ('_habit', '_process', '_preempted', '_own')
+    What passes between ``pause`` and ``resume``, while it waits without a worker, does not count.
+    """
 
-    _process: int | None
+    __slots__ = ('_habit', '_process', '_preempted', '_own', '_start', '_sums')
 
     def __init__(self, habit: GilHabit) -> None:
         self._habit = habit
-        self._process = None  # other threads may change the habit meanwhile
-        if habit.rests < 1:
-            self._process, self._preempted = process_time_ns(), times_preempted()
-        self._own = thread_time_ns()
+        # other threads may change the habit meanwhile, so it is asked once
+        self._sums: list[int] | None = [0, 0, 0] if habit.rests < 1 else None
+        self._own = 0
+        self._process = self._preempted = self._start = 0
+        self.resume()
 
-    def end(self, wall: int, has_lent: bool) -> int:
-        """
-        Return the CPU time of the calling thread, ns.
+    def resume(self) -> None:
+        """Begin to measure again."""
+        if self._sums is not None:
+            self._start, self._process = monotonic_ns(), process_time_ns()
+            self._preempted = times_preempted()
+        self._own -= thread_time_ns()
 
-        :param wall: the duration of the execution, ns.
-        :param has_lent: whether it waited without a worker: then only its CPU time counts.
-        """
-        own = thread_time_ns() - self._own
-        if self._process is None:
+    def pause(self) -> None:
+        """Measure nothing until ``resume``."""
+        self._own += thread_time_ns()
+        if self._sums is not None:
+            self._sums[0] += monotonic_ns() - self._start
+            self._sums[1] += process_time_ns() - self._process
+            self._sums[2] += times_preempted() - self._preempted
+
+    def end(self) -> int:
+        """Return the CPU time of the calling thread, ns."""
+        self.pause()
+        own = self._own
+        if self._sums is None:
             self._habit.rests -= 1
         else:
-            self._habit.took(own, own if has_lent else wall)
-            self._habit.learn(wall, own, process_time_ns() - self._process - own,
-                              times_preempted() > self._preempted)
+            wall, process, preempted = self._sums
+            self._habit.took(own, wall)
+            self._habit.learn(wall, own, process - own, preempted > 0)
         return own
 
 

@@ -24,9 +24,14 @@ Theory of operation
 5.  *Time*, and the arrivals not announced while a callback holds the GIL, are in ``due``.
 6.  *Lending.*  A callback that waits inside ``Client.call`` returns its worker to the core.  If
     fewer threads are left than there are workers, a thread is made.  At most ``MOST`` callbacks
-    lend at the same time; further ones keep their workers.
+    lend at the same time; further ones keep their workers.  When it has its answer, it *rejoins*:
+    it waits in the core like any other execution, and its thread waits for its permit.  The thread
+    that dispatches it hands its worker over, and chooses again.  All workers may run callbacks
+    that wait for this one (it may own a lock).  So if in ``REJOIN_NS`` no execution has ended, and
+    the process has computed nothing, it goes on without a worker; as it does when a spin ends, or
+    in ``spin_once``, where only one callback runs.
 7.  *Coroutines.*  A coroutine that waits for a future is suspended.  It keeps its callback group
-    but no worker.  When the future is done, it becomes ready again, with the same key.
+    but no worker.  When the future is done, it becomes ready again, too.
 8.  *Errors.*  An exception of a callback or of a thread of the pool goes to ``fail`` and ends the
     spin.
 """
@@ -38,7 +43,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 import threading
-from time import monotonic_ns
+from time import monotonic_ns, process_time_ns
 from typing import Any, TYPE_CHECKING
 import weakref
 
@@ -50,6 +55,7 @@ from mddag_executor.executor.bounds import (
     GUARD_NS,
     MOST,
     MOST_YIELD_NS,
+    REJOIN_NS,
     SHORT_CALLBACK_NS,
 )
 from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN
@@ -81,9 +87,10 @@ class WorkerThread:
 
     :ivar work: the running execution.
     :ivar worker: the number of its last worker in the core.
-    :ivar permit: a lock, released to admit the thread to the epoll.
-    :ivar has_lent: whether its callback has returned its worker; ``waits``: whether it still
-        waits.
+    :ivar permit: a lock, released to admit the thread to the epoll, or to let its callback go on.
+    :ivar has_lent: whether its callback has returned its worker at any time; ``is_out``: whether
+        it has none now; ``waits``: whether it still waits for what it lent its worker for.
+    :ivar measurement: of its running callback; None: it is not measured.
     :ivar waits_since: since when it has waited in the epoll, on the trace's clock; 0: it does not.
     :ivar is_parked: whether it waits for its permit.
     :ivar published: when the running callback first published (monotonic ns); 0: not yet.
@@ -95,7 +102,7 @@ class WorkerThread:
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
                  'is_parked', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
-                 'waits_since')
+                 'waits_since', 'is_out', 'measurement')
 
     def __init__(self, pool: WorkerPool, thread: threading.Thread | None) -> None:
         self.pool = pool
@@ -106,7 +113,8 @@ class WorkerThread:
         self.permit = threading.Lock()
         self.permit.acquire()
         self.vtid = self.ident = 0
-        self.waits = self.has_lent = False
+        self.waits = self.has_lent = self.is_out = False
+        self.measurement: Measurement | None = None
         self.is_parked = True
         self.published = self.start = self.end = self.waits_since = 0
         self.outcome: Any = None
@@ -179,6 +187,9 @@ class WorkerPool:
         self.stopped_at = 0
         self.is_current = False
         self.lent = 0
+        # the threads of executions that have lent their workers, and wait to go on
+        self._rejoining: dict[Work, WorkerThread] = {}
+        self._n_ended = 0
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
         self.context: Any = None
@@ -267,7 +278,7 @@ class WorkerPool:
 
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready to go on."""
-        self.report(lambda now: self.engine.resume(work))
+        self.report(partial(self.engine.resume, work))
 
     def leave_group(self, work: Work) -> None:
         """Note that the callback group of an execution has let it run."""
@@ -358,6 +369,7 @@ class WorkerPool:
         """Start no more executions; running ones finish.  No thread waits in the epoll then."""
         with self.lock:
             self.start_no_more()
+            self._let_go_on()
             self.muting.end()
             self.due.arm(0)
             if not self.polling or self._leaving:
@@ -553,6 +565,7 @@ class WorkerPool:
             work: Any = me.work
             if work is not None:
                 me.work = None
+                self._n_ended += 1
                 if me.outcome is None and not me.has_lent:
                     engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
                     if engine.to_ask_again:
@@ -601,7 +614,10 @@ class WorkerPool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         engine = self.engine
         due = self.due
-        work = engine.dispatch(me.worker, now) if self.running else None
+        work: Any = engine.dispatch(me.worker, now) if self.running else None
+        while work in self._rejoining:
+            self._hand_over(work, now)
+            work = engine.dispatch(me.worker, now)
         if (engine.deadlines.next < due.deadline
                 or work is None and (due.may_expire_early or engine.holders)):
             due.arm(now - self._offset)
@@ -673,6 +689,7 @@ class WorkerPool:
         measurement = None
         if habit.rests < 1 or self.engine.record is not None:
             measurement = Measurement(habit)
+        me.measurement = measurement
         me.published = 0
         start = monotonic_ns()
         try:
@@ -699,7 +716,7 @@ class WorkerPool:
         if measurement is None:
             habit.rests -= 1
         else:
-            work.cpu_ns += measurement.end(wall, me.has_lent)
+            work.cpu_ns += measurement.end()
             if entity.is_nested != habit.computes and entity.classify is not None:
                 with self.lock:
                     if entity.classify is not None:  # it may have been removed meanwhile
@@ -718,8 +735,8 @@ class WorkerPool:
         me.outcome = None
         if me.has_lent:
             worker = -1
-            me.has_lent = False
-            self._waiting_calls -= 1
+            self._waiting_calls -= me.is_out
+            me.has_lent = me.is_out = False
         if isinstance(outcome, Refused):
             engine.refused(work, now)
             self.due.call_at(
@@ -765,9 +782,10 @@ class WorkerPool:
     @contextmanager
     def lend(self, me: WorkerThread) -> Iterator[None]:
         """Lend the worker of a running callback to other threads."""
+        lends = False
         with self.lock:
-            if not me.has_lent and me.work is not None and self._waiting_calls < MOST:
-                me.has_lent = True
+            if not me.is_out and me.work is not None and self._waiting_calls < MOST:
+                lends = me.has_lent = me.is_out = True
                 self._waiting_calls += 1
                 self.lent += 1
                 self.tick()
@@ -779,13 +797,69 @@ class WorkerPool:
                     self.wake_for_more()
                 else:
                     self._admit()
-        waits_before, me.waits = me.waits, me.has_lent
+        measurement = me.measurement if lends else None
+        if measurement is not None:
+            measurement.pause()
+        waits_before, me.waits = me.waits, me.is_out
         try:
             executor = self.executor if me.thread is None else None
             with nullcontext() if executor is None else executor.serve_meanwhile():
                 yield
         finally:
             me.waits = waits_before
+            if lends and me.thread is not None:
+                self._rejoin(me)
+            if measurement is not None:
+                measurement.resume()
+
+    def _rejoin(self, me: WorkerThread) -> None:
+        """Wait until the callback of the calling thread, which has lent its worker, may go on."""
+        engine = self.engine
+        work: Any = me.work
+        with self.lock:
+            now = self.tick()
+            if not self.running:
+                return
+            is_first = not engine.has_waiting
+            engine.rejoin(work, now)
+            self._rejoining[work] = me
+            # what waits already is chosen by another thread, as this one cannot run it
+            first = engine.dispatch(me.worker, now) if is_first else None
+            if first is not None:
+                self._hand_over(first, now)
+            if not self.polling:
+                self._admit()
+            elif engine.may_start_more(now):
+                self._wake_one()
+            elif engine.holders and engine.idle_workers:
+                self.due.check_holder(now - self._offset)
+            seen = self._n_ended, process_time_ns()
+        while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
+            with self.lock:
+                before, seen = seen, (self._n_ended, process_time_ns())
+                if (work in self._rejoining and before[0] == seen[0]
+                        and seen[1] - before[1] < REJOIN_NS // 10):
+                    self._go_on_without(work)
+
+    def _hand_over(self, work: Work, now: int) -> None:
+        """Let an execution go on that was dispatched again; the caller holds the lock."""
+        thread = self._rejoining.pop(work)
+        thread.worker = work.worker
+        thread.is_out = False
+        self._waiting_calls -= 1
+        thread.permit.release()
+        if self.engine.holders and self.engine.has_waiting:
+            self.due.check_holder(now - self._offset)
+
+    def _go_on_without(self, work: Work) -> None:
+        """Let an execution go on without a worker; the caller holds the lock."""
+        self.engine.go_on_without(work)
+        self._rejoining.pop(work).permit.release()
+
+    def _let_go_on(self) -> None:
+        """Let all executions go on that wait for their workers; the caller holds the lock."""
+        for work in list(self._rejoining):
+            self._go_on_without(work)
 
     # --- spin_once -------------------------------------------------------------------------------
 
@@ -798,6 +872,7 @@ class WorkerPool:
         finally:
             with self.lock:
                 self.running = self._is_stepping = False
+                self._let_go_on()
                 self.muting.end()
 
     def resume_stepping(self) -> None:

@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from mddag_executor.executor.compat import alive, BareExecutor
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.tasks import make_task, Unclaimed
-from mddag_executor.executor.work import QuickCallback
+from mddag_executor.executor.work import QuickCallback, Work
 from mddag_executor.hosting.host import Guest, Host
 from mddag_executor.rerun.loop import Loop, POLL_NS
 from rclpy.node import Node
@@ -39,9 +38,12 @@ class NodeHolder(BareExecutor):
             task()
             return task
         loop = self._loop
+
+        def resume(work: Work) -> None:
+            loop.call_in_run(lambda: loop.engine.resume(work, loop.now))
+
         task, work = make_task(
-            self.task_entity, self, lambda work: loop.call_in_run(
-                partial(loop.engine.resume, work)), self._unclaimed, callback, args, kwargs)
+            self.task_entity, self, resume, self._unclaimed, callback, args, kwargs)
         loop.call_in_run(lambda: loop.engine.ready(work, loop.now))
         return task
 

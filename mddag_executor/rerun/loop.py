@@ -340,7 +340,9 @@ class Loop:
             engine.ask_again()
 
     def _resume_when_done(self, work: Work, waits_for: Any) -> None:
-        resume = partial(self.engine.resume, work)
+        def resume() -> None:
+            self.engine.resume(work, self.now)
+
         if waits_for is NEXT_TURN or not hasattr(waits_for, 'add_done_callback'):
             self.at(self.now + POLL_NS, ARRIVED, resume)
         else:

@@ -274,9 +274,26 @@ class LiveDriver(RuleBasedStateMachine):
     def resume(self, data):
         away = self.with_fate(SUSPENDED, REFUSED)
         if away:
-            run = data.draw(st.sampled_from(away))
-            self.scheduler.resume(run.x)
-            run.fate = WAITING
+            self.go_on(data.draw(st.sampled_from(away)))
+
+    def go_on(self, run):
+        if run.fate == REFUSED:
+            self.scheduler.ask_again(run.x)
+        else:
+            self.scheduler.resume(run.x, 0, int(run.holds), self.now)
+        run.fate, run.lent = WAITING, False
+
+    @rule(data=st.data())
+    def rejoin(self, data):
+        """One that has lent its worker wants one again; or no more, as nothing would give it."""
+        lent = [run for run in self.with_fate(RUNNING) if run.lent]
+        waiting = [run for run in self.with_fate(WAITING) if run.began]
+        if waiting and data.draw(st.booleans()):
+            run = data.draw(st.sampled_from(waiting))
+            self.scheduler.go_on_without(run.x)
+            run.fate, run.lent = RUNNING, True
+        elif lent:
+            self.go_on(data.draw(st.sampled_from(lent)))
 
     @rule()
     def expire_idle(self):
@@ -420,8 +437,7 @@ class LiveDriver(RuleBasedStateMachine):
             return
         for _ in range(10 * len(self.runs) + 10):
             for run in self.with_fate(SUSPENDED, REFUSED):
-                self.scheduler.resume(run.x)
-                run.fate = WAITING
+                self.go_on(run)
             for run in self.with_fate(RUNNING):
                 self.complete_one(run)
             self.dispatch(0)

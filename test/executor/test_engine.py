@@ -440,6 +440,8 @@ class Twin:
         self.entities[4].source = 0
         self.running = []
         self.suspended = []
+        self.lent = []
+        self.returning = []
         self.count = 0
 
     def do(self, step, which, now):
@@ -454,18 +456,31 @@ class Twin:
                 engine.timer_due(work, now, now)
         elif step == 'dispatch':
             started = engine.dispatch(which % 2, now)
+            self.returning = [each for each in self.returning if each is not started]
             self.running += [started] * (started is not None)
         elif step == 'remove':
             engine.remove(entity, now)
             entity.removed = False
         elif step == 'resume' and self.suspended:
-            engine.resume(self.suspended.pop(which % len(self.suspended)))
+            engine.resume(self.suspended.pop(which % len(self.suspended)), now)
+        elif step == 'rejoin' and self.lent:
+            work = self.lent.pop(which % len(self.lent))
+            self.running.remove(work)
+            self.returning.append(work)
+            engine.rejoin(work, now)
+        elif step == 'go_on' and self.returning:
+            work = self.returning.pop(which % len(self.returning))
+            engine.go_on_without(work)
+            self.running.append(work)
+            self.lent.append(work)
         elif step in ('finish', 'fail', 'suspend', 'lend') and self.running:
             work = self.running[which % len(self.running)]
             if step == 'lend':
                 engine.lend(work)
+                self.lent += [work] * (work not in self.lent)
             else:
                 self.running.remove(work)
+                self.lent = [each for each in self.lent if each is not work]
             if step == 'suspend':
                 engine.suspended(work, now, now, 0, work.worker)
                 self.suspended.append(work)
@@ -483,7 +498,7 @@ class Twin:
 @examples(300)
 @given(st.sampled_from(sorted(POLICIES)), st.lists(st.tuples(st.sampled_from([
     'ready', 'ready', 'ready', 'dispatch', 'dispatch', 'finish', 'finish', 'suspend', 'resume',
-    'lend', 'fail', 'remove']), st.integers(0, 4)), max_size=80))
+    'lend', 'rejoin', 'go_on', 'fail', 'remove']), st.integers(0, 4)), max_size=80))
 def test_what_bypasses_the_core_runs_as_the_core_would_run_it(policy, steps):
     twins = Twin(policy), Twin(policy)
     twins[1].engine.allow_bypass()

@@ -16,7 +16,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import matched, Spinning, wait_for
+from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import Declared, graph
 
 MS = 1_000_000
@@ -193,6 +193,125 @@ def test_what_cannot_start_is_left_in_the_middleware(computing):
     computing.habit.mean_ns = 20_000 * MS
     assert computing.order('patient') == ['begins', 'ends', 'patient']
     assert queued == [0]
+
+
+# --- callbacks that lend their workers, and go on ------------------------------------------------
+
+class Lending:
+    """
+    A callback that lends its worker until ``bell`` is set, and others that run until ``leave`` is.
+
+    :ivar ran: the names of those that have begun, and what the lending one does after that.
+    :ivar then: called when it goes on.
+    """
+
+    def then(self):
+        """Do nothing more."""
+
+    def __init__(self, make_executor, make_node, workers, **callbacks):
+        self.ran = []
+        self.bell, self.leave = threading.Event(), threading.Event()
+        text = declare(*((
+            name, f'subscription: /{name}, period: 1s, deadline: {deadline}, '
+            'holds_interpreter: true') for name, deadline in callbacks.items()))
+        nodes = Declared(make_node, text, {name: partial(self._run, name) for name in callbacks})
+        self.executor = make_executor(
+            loads(text), num_workers=workers, nodes=nodes.nodes.values())
+        other = make_node('publishes')
+        self._publishers = {
+            name: other.create_publisher(Header, f'/{name}', 10) for name in callbacks}
+        matched(*self._publishers.values())
+
+    def start(self, name):
+        """Let a callback begin."""
+        self._publishers[name].publish(Header())
+        assert wait_for(lambda: name in self.ran), self.ran
+
+    def wait_in_queue(self, *names):
+        """Let some become ready, after what waits."""
+        before = self.executor.statistics()['queue']
+        for name in names:
+            self._publishers[name].publish(Header())
+        assert wait_for(lambda: self.executor.statistics()['queue'] == before + len(names))
+
+    def go_on(self):
+        """Let the lending one go on, if it may."""
+        before = self.executor.statistics()['queue']
+        self.bell.set()
+        assert wait_for(
+            lambda: self.executor.statistics()['queue'] > before or 'goes on' in self.ran)
+
+    def _run(self, name):
+        self.ran.append(name)
+        if name == 'lends':
+            with self.executor.lend():
+                assert self.bell.wait(15.0)
+            self.ran.append('goes on')
+            self.then()
+            self.ran.append('ends')
+        elif name == 'blocks':
+            self.compute()
+        elif 'waits' in name:
+            assert self.leave.wait(15.0)
+
+    def compute(self):
+        """Compute until ``leave`` is set."""
+        while not self.leave.is_set():
+            compute(1)
+
+
+@pytest.mark.parametrize('workers', [1, 7])
+def test_a_callback_that_has_lent_its_worker_goes_on_in_order(make_executor, make_node, workers):
+    """It needs a worker and the interpreter again: what is more urgent goes before it."""
+    lending = Lending(
+        make_executor, make_node, workers, lends='50s', blocks='40s', urgent='45s', patient='60s')
+    with Spinning(lending.executor):
+        lending.start('lends')
+        lending.start('blocks')
+        lending.go_on()
+        lending.wait_in_queue('patient', 'urgent')
+        assert lending.ran == ['lends', 'blocks']
+        lending.leave.set()
+        assert wait_for(lambda: len(lending.ran) == 6)
+    assert lending.ran == ['lends', 'blocks', 'urgent', 'goes on', 'ends', 'patient']
+
+
+def test_others_wait_for_a_callback_that_goes_on(make_executor, make_node):
+    """It holds the interpreter as it did before."""
+    lending = Lending(make_executor, make_node, 7, lends='50s', patient='60s')
+    lending.then = lending.compute
+    with Spinning(lending.executor):
+        lending.start('lends')
+        lending.go_on()
+        assert wait_for(lambda: 'goes on' in lending.ran)
+        lending.wait_in_queue('patient')
+        lending.leave.set()
+        assert wait_for(lambda: len(lending.ran) == 4)
+    assert lending.ran == ['lends', 'goes on', 'ends', 'patient']
+
+
+def test_workers_that_wait_for_a_callback_do_not_keep_it_waiting(make_executor, make_node):
+    """It may own a lock: if all workers wait, it goes on without one."""
+    lending = Lending(make_executor, make_node, 2, lends='50s', waits='40s', other_waits='40s')
+    lending.then = lending.leave.set
+    with Spinning(lending.executor):
+        for name in ('lends', 'waits', 'other_waits'):
+            lending.start(name)
+        lending.bell.set()
+        assert wait_for(lambda: is_idle(lending.executor))
+    assert lending.ran[3:] == ['goes on', 'ends']
+
+
+def test_a_callback_that_has_lent_its_worker_ends_though_the_spin_does(
+        spinning, make_executor, make_node):
+    """It began in this spin, so it ends in it."""
+    lending = Lending(make_executor, make_node, 1, lends='50s', blocks='40s')
+    with spinning(lending.executor):
+        lending.start('lends')
+        lending.start('blocks')
+        lending.go_on()
+        threading.Timer(0.05, lending.leave.set).start()
+    assert sorted(lending.ran) == ['blocks', 'ends', 'goes on', 'lends']
 
 
 # --- at random -----------------------------------------------------------------------------------

@@ -6,13 +6,16 @@ import inspect
 import threading
 import time
 
+from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future, Task
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import Spinning, wait_for
+from .conftest import matched, Spinning, wait_for
+from .declared import graph
 
 # --- like rclpy's executor -----------------------------------------------------------------------
 
@@ -267,6 +270,37 @@ def test_a_spin_that_waits_for_a_task_raises_its_exception(make_executor, steps)
         spin(task)
     assert maker.done()
     spin(executor.create_task(lambda: time.sleep(0.06)))  # exceptions are checked in that time
+
+
+@pytest.mark.usefixtures('each_rclpy')
+@pytest.mark.parametrize('declared, order', [(False, 'bba'), (True, 'bab')])
+def test_a_coroutine_that_goes_on_counts_from_then_unless_it_belongs_to_a_job(
+        make_executor, make_node, declared, order):
+    """One that began long ago does not go before everything that was ready before it."""
+    future, begun, ran = Future(), [], []
+
+    async def wait(_):
+        begun.append('a')
+        await future
+        ran.append('a')
+
+    node = make_node()
+    node.create_subscription(Header, '/a', wait, 10)
+    publisher = make_node('other').create_publisher(Header, '/a', 10)
+    text = graph(node='name: a, subscription: /a, period: 1s, deadline: 60s')
+    executor = make_executor(
+        loads(text) if declared else None, default_deadline='120s', nodes=[node])
+    matched(publisher)
+    publisher.publish(Header())
+    while not begun:
+        executor.spin_once(1.0)
+    for _ in range(2):
+        executor.create_task(ran.append, 'b')
+    executor.spin_once(0)
+    future.set_result(None)
+    for _ in range(2):
+        executor.spin_once(0)
+    assert ''.join(ran) == order
 
 
 @pytest.mark.usefixtures('each_rclpy')

@@ -341,7 +341,7 @@ class VirtualRun:
                 self.waited[key] += start - work.ready
         if declared and self.random.random() < self.chances.coroutine:
             self.scheduler.suspend(work.x)
-            self._at(now + self.random.randrange(MS), lambda later: self._resume(work))
+            self._at(now + self.random.randrange(MS), lambda later: self._resume(work, later))
             return
         if declared and self.random.random() < self.chances.failed:
             self.scheduler.give_up(work.slot, FAILED, end)
@@ -353,9 +353,9 @@ class VirtualRun:
                         work.leg)
         self.decided(now)
 
-    def _resume(self, work):
+    def _resume(self, work, now):
         work.pieces += 1
-        self.scheduler.resume(work.x)
+        self.scheduler.resume(work.x, 0, 0, now)
         self._waiting[work.x] = work
 
     def _address(self, vertex):

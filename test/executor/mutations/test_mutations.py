@@ -134,11 +134,19 @@ client.completed = getattr(client, 'completed', 0) + 1
         future.set_result(response)""")], of(
         'test_executor.py', 'test_each_of_many_runs_once[spin-of_services]')),
     Case('coroutines_not_resumed', [(
-        'executor/engine.py', 'self._core().resume(work.x)', 'pass')], [
+        'executor/engine.py', 'self._core().resume(', 'print(')], [
         *of('test_executor.py', 'test_each_of_many_runs_once[spin-of_coroutines]'),
         *of('test_tasks.py',
             'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done[installed]')],
         every=True),
+    Case('what_was_lent_is_not_returned', [(
+        'executor/workers.py', 'if lends and me.thread is not None:', 'if False:')], of(
+        'test_gil.py', 'test_others_wait_for_a_callback_that_goes_on',
+        'test_a_callback_that_has_lent_its_worker_goes_on_in_order[1]',
+        'test_a_callback_that_has_lent_its_worker_goes_on_in_order[7]'), every=True),
+    Case('those_that_go_on_wait_for_ever', [(
+        'executor/workers.py', 'self._go_on_without(work)', 'pass')], of(
+        'test_gil.py', 'test_workers_that_wait_for_a_callback_do_not_keep_it_waiting')),
     Case('what_bypasses_the_core_stays_unknown', [(
         'executor/engine.py', 'self._start_next(work.worker, self._bypassing_since)', 'pass')],
         of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
