@@ -519,6 +519,10 @@ def resume(
     if s.x_vertex[x] == t.n_vertices:
         order = s.scalars[ORDER] = s.scalars[ORDER] + 1
         s.x_key[x] = key(t, t.n_vertices, now, job, order) + (x,)
+        slot = s.x_slot[x]
+        s.job_demoted[slot] = -1
+        if s.job_hope[slot] < NEVER:
+            s.job_hope[slot] = now
     s.x_holds[x] = holds
     s.x_state[x] = WAITING
     heappush(s.ready, s.x_key[x])

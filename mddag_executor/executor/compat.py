@@ -315,6 +315,25 @@ class BareTask(Task):
         self._exception_fetched = True
 
 
+def function_of_task(callback: Any, args: tuple[Any, ...]) -> object:
+    """
+    Return what a task's function has in common with others that do the same: its code.
+
+    An action server runs each goal in a task of its method ``_execute_goal``: then it is the code
+    of the goal's callback.
+    """
+    while isinstance(callback, partial):
+        callback, args = callback.func, (*callback.args, *args)
+    if inspect.iscoroutine(callback):
+        return callback.cr_code
+    function = getattr(callback, '__func__', callback)
+    name = getattr(function, '__qualname__', '')
+    if name == 'ActionServer._execute_goal' and args:
+        return function_of_task(args[0], ())
+    code: object = getattr(function, '__code__', None)
+    return (type(callback), name) if code is None else code
+
+
 def forget_task_frames(error: BaseException) -> None:
     """Remove the frames in which a task caught its exception: they refer to the task."""
     trace = error.__traceback__

@@ -159,10 +159,10 @@ class DueTimes:
         holder = self._engine.interpreter_holder()
         if holder is None:
             return
-        after = LAST_CHECK_NS
+        after, step = LAST_CHECK_NS, min(CHECK_NS, self._engine.patience() // 2)
         if is_late or holder.entity.wall_ns > SHORT_CALLBACK_NS:
-            after = max(CHECK_NS, 2 * holder.entity.habit.mean_ns)
-        self._gil_check.begin(holder, now, after)
+            after = max(step, 2 * holder.entity.habit.mean_ns)
+        self._gil_check.begin(holder, now, after, step)
 
     def _check_gil(self, now: int) -> None:
         """Take the GIL from an execution that waits for anything else."""
@@ -200,16 +200,16 @@ class Guard(ChannelSource):
 
     All methods but ``collect`` need the engine's lock.  The guard has a separate timerfd, which
     the spinning thread waits for.  Setting and clearing a time for each callback would cost more
-    than the callback (9 us on a virtual machine).  So the time is set once, and neither changed
-    nor cleared until it expires.
+    than the callback (9 us on a virtual machine).  So the time is not cleared until it expires,
+    and changed only to an earlier one.
 
     :param expired: called when the time expires; it calls ``end``.
-    :ivar is_set: whether a time is set.
+    :ivar at: the time that is set (monotonic ns); NEVER: none.
     """
 
     def __init__(self, expired: Callable[[], None]) -> None:
         self._timer = TimerFd()
-        self.is_set = False
+        self.at = NEVER
         self.fd = self._timer.fd
         self._expired = expired
 
@@ -218,14 +218,13 @@ class Guard(ChannelSource):
         self._expired()
 
     def set(self, at: int) -> None:
-        """Set the time (monotonic ns), unless one is set."""
-        if not self.is_set:
-            self.is_set = True
-            self._timer.arm(at)
+        """Set the time (monotonic ns)."""
+        self.at = at
+        self._timer.arm(at)
 
     def end(self) -> None:
         """Note that the time has expired."""
-        self.is_set = False
+        self.at = NEVER
 
     def close(self) -> None:
         """Close the descriptor, once."""

@@ -56,7 +56,7 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
-from mddag_executor.executor.bounds import MOST, SHORT_CALLBACK_NS
+from mddag_executor.executor.bounds import GUARD_NS, GUARD_PART, MOST, SHORT_CALLBACK_NS
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity, SUBSCRIPTION, TIMER
 from mddag_executor.executor.jobs import Announced, Jobs, NO_ORIGIN, Origin
@@ -448,6 +448,13 @@ class Engine:
         work = self._lane[0] if self._lane else self._work.get(ready[0][4]) if ready else None
         return now if work is None else work.ready_ns
 
+    def patience(self) -> int:
+        """Return how long what is ready may wait for a callback that was expected to end, ns."""
+        ready = self._state.ready
+        vertex = self._state.x_vertex[ready[0][4]] if ready else self.tables.n_vertices
+        return min(GUARD_NS, max(
+            2 * SHORT_CALLBACK_NS, self.tables.rad_offset[vertex] // GUARD_PART))
+
     @property
     def idle_workers(self) -> int:
         """Return the number of workers that run nothing."""
@@ -614,6 +621,11 @@ class Engine:
         del self._work[work.x]
         self._core().go_on_without(work.x)
 
+    def begun(self) -> list[Work]:
+        """Return the coroutines that have begun, and are suspended or wait to go on."""
+        return [work for work in self._work.values()
+                if work.coroutine is not None and self._state.x_started[work.x] >= 0]
+
     def leave_group(self, work: Work) -> None:
         """Note that an execution's callback group has let it run (see ``work``)."""
         self.scheduler.leave_group(work.x)
@@ -687,6 +699,7 @@ class Engine:
 
     def refused(self, work: Work, now: int) -> None:
         """Put an execution back that its callback group has refused (see ``work``)."""
+        self._core()
         entity, x = work.entity, work.x
         if entity.removed:
             self.destroyed(work, now)

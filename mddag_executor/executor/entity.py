@@ -40,9 +40,8 @@ class Entity:
         'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'lost',
         'skipped', 'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
         'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
-        'publishes', 'at_once',
-        'habit', 'since', 'gate', 'most_waiting', 'collect_more', 'classify', 'is_nested',
-        'queue', '__weakref__')
+        'publishes', 'at_once', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
+        'collect_more', 'classify', 'is_nested', 'queue', '__weakref__')
 
     def __init__(
         self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
@@ -91,10 +90,8 @@ class Entity:
         # whether it was destroyed; whether that, or a timer's end, must be checked first
         self.removed = False
         self.may_be_gone = kind == TIMER
-        # whether it holds the interpreter while it runs (one entity represents all tasks, whatever
-        # they do)
-        self.habit = GilHabit(
-            False if kind == TASK else None if callback is None else callback.holds_interpreter)
+        # whether it holds the interpreter while it runs
+        self.habit = GilHabit(None if callback is None else callback.holds_interpreter)
         # when the executor began to manage it, on the trace's clock: no job is due before
         self.since = 0
         # whether it is handled at once (see ``at_once``)
@@ -108,6 +105,8 @@ class Entity:
         self.is_nested = 0
         # runs a step in its callback group, if that must be asked (``work.step_in_group``)
         self.gate: Callable_[..., Any] | None = None
+        # its mutually exclusive callback group, which is told of each execution
+        self.exclusive: Any = None
         self.address = new_address()
         # entered before a callback runs: it raises once the entity is destroyed
         self.handle = rclpy.handle if kind in _HAVE_HANDLES else None

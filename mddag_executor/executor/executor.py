@@ -43,7 +43,6 @@ from mddag_executor.executor.compat import (
 from mddag_executor.executor.diagnostics import Diagnostics
 from mddag_executor.executor.ending import Ending, weakly
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.gil import short_switch_interval
 from mddag_executor.executor.loop import raise_limit
 from mddag_executor.executor.misses import MissNotifier
@@ -58,7 +57,7 @@ from mddag_executor.executor.shutdown import (
 )
 from mddag_executor.executor.statistics import statistics
 from mddag_executor.executor.statistics_types import Statistics
-from mddag_executor.executor.tasks import make_task, Unclaimed, watched
+from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, watched
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.waitables import WaitSetThread
@@ -217,9 +216,9 @@ class MultiDeadlineExecutor(BareExecutor):
         process = self._process
         self._registry = Registry(task_set, self._engine, self._pool.leave_group)
         self._new_tasks: deque[Work] = deque()
-        self._task_entity = Entity(TASK, None, '', None, -1, 0, '')
+        self._task_entities = TaskEntities()
         if self._recorder is not None:
-            self._recorder.entities((), [self._task_entity])
+            self._recorder.entities((), [self._task_entities.others])
         self._names = NameCheck(task_set, self._registry, process)
         self._announcements: Announcements | None = None
         self._check_at: list[float] = []  # when to check again whether the context has ended
@@ -322,7 +321,8 @@ class MultiDeadlineExecutor(BareExecutor):
             task()
             return task
         task, work = make_task(
-            self._task_entity, self, self._pool.resume, self._unclaimed, callback, args, kwargs)
+            self._task_entities.of(callback, args), self, self._pool.resume, self._unclaimed,
+            callback, args, kwargs)
         is_spinning = self._spinning.locked()
         if is_spinning:
             self._pool.report(self._engine.ready, work)

@@ -21,14 +21,15 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
 3.  *A callback that computes with the GIL released* (numpy, hashlib) is measured as if it held it.
     Declare ``holds_interpreter: false`` to run several such callbacks in parallel.
 4.  *A callback that waits though it usually computes* would keep others from the GIL.
-    ``GilCheck`` checks its thread while others wait for the GIL, first after ``CHECK_NS``
-    and then at growing intervals.  If the thread waits, the execution gives the GIL up.
+    ``GilCheck`` checks its thread while others wait for the GIL, first after ``CHECK_NS``, or less
+    if what waits is urgent, and then at growing intervals.  If the thread waits, the execution
+    gives the GIL up.
 5.  *Waiting, not starving.*  A thread that has not computed since the last check may have waited
-    for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU and is
-    asleep, because a thread that waits for the GIL wakes up every ``SWITCH_INTERVAL_S``.  It also
-    did if, for half of the time, it was not ready to run and no other thread computed.  Anything
-    else is unclear, and counts only after ``LATELY`` checks, so that the GIL is not
-    withheld from others for ever.
+    for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU for
+    ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
+    ``SWITCH_INTERVAL_S``.  It also did if, for a quarter of the time, it was not ready to run and
+    no other thread computed.  Anything else is unclear, and counts only after ``LATELY`` checks,
+    so that the GIL is not withheld from others for ever.
 """
 
 from __future__ import annotations
@@ -279,28 +280,31 @@ class GilCheck:
     :ivar subject: the execution to check.
     """
 
-    __slots__ = ('at', 'subject', '_step', '_last', '_unclear')
+    __slots__ = ('at', 'subject', '_step', '_first', '_last', '_unclear')
 
     def __init__(self) -> None:
         self.at = NEVER
         self.subject: object = None
-        self._step = 0
+        self._step = self._first = 0
         self._last: _Reading | None = None
         self._unclear = 0
 
-    def begin(self, subject: object, now: int, after: int) -> None:
+    def begin(self, subject: object, now: int, after: int, step: int) -> None:
         """
         Start checking an execution, unless it is being checked already as soon.
 
-        :param after: time until the first check, ns.
+        :param after: time until the first check, ns; ``step``: from that to the second one.
         """
         if self.subject is not subject or after < self._step:
+            self._first = step
             self.subject = subject
             self._step = after
             self._last = None
             self._unclear = 0
-            # on a grid, so that several short callbacks do not each set the timer again
-            self.at = (now + self._step) // CHECK_NS * CHECK_NS + CHECK_NS
+            self.at = now + after
+            if after >= LAST_CHECK_NS:
+                # on a grid, so that several short callbacks do not each set the timer again
+                self.at = self.at // CHECK_NS * CHECK_NS + CHECK_NS
 
     def end(self) -> None:
         """Stop checking."""
@@ -316,7 +320,7 @@ class GilCheck:
         """
         last = self._last
         new = self._last = _Reading(now, cpu_ns(ident), process_time_ns(), schedule_of(tid))
-        self._step = CHECK_NS if last is None else min(2 * self._step, LAST_CHECK_NS)
+        self._step = self._first if last is None else min(2 * self._step, LAST_CHECK_NS)
         self.at = now + self._step
         if last is None:
             return False
@@ -325,11 +329,11 @@ class GilCheck:
             self._unclear = 0
             return False
         if new.schedule.is_asleep:
-            if new.schedule.slices == last.schedule.slices >= 0:
+            if passed >= CHECK_NS and new.schedule.slices == last.schedule.slices >= 0:
                 return True
             others = max(0, new.process - last.process - own)
             delayed = new.schedule.delay_ns - last.schedule.delay_ns
-            if passed - others - delayed >= WAITS * passed:
+            if 4 * (passed - others - delayed) >= passed:
                 return True
         self._unclear += 1
         return self._unclear >= LATELY

@@ -248,6 +248,8 @@ class Registry:
         entity = Entity(kind, rclpy_entity, node, callback, number, depth, label)
         if decides:
             entity.gate = partial(step_in_group, group, rclpy_entity, self._passed)
+        elif group is not None and number >= 0 and group.has_entity(rclpy_entity):
+            entity.exclusive = group
         if kind == SUBSCRIPTION and depth == 0:
             entity.most_waiting = MOST
         elif kind == SERVICE:

@@ -24,8 +24,9 @@ import inspect
 from typing import Any
 import weakref
 
-from mddag_executor.executor.compat import BareTask, forget_task_frames
-from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.bounds import REMEMBERED
+from mddag_executor.executor.compat import BareTask, forget_task_frames, function_of_task
+from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.work import current, QuickCallback, TaskWork, Work
 from rclpy.task import Future
 
@@ -160,6 +161,32 @@ def watched(future: Future, notify: Callable[[], object]) -> Iterator[None]:
     error = None if task is None else task.claim()
     if error is not None:
         raise error
+
+
+class TaskEntities:
+    """
+    The executor's records of tasks: one for each function, as each has its own GIL habit.
+
+    In a trace all tasks are of the same callback.
+
+    :ivar others: of functions beyond the ``REMEMBERED`` first ones.
+    """
+
+    def __init__(self) -> None:
+        self.others = Entity(TASK, None, '', None, -1, 0, '')
+        self._entities: dict[object, Entity] = {}
+
+    def of(self, callback: Any, args: tuple[Any, ...]) -> Entity:
+        """Return the record of a task's function; an action's goals have that of its callback."""
+        function = function_of_task(callback, args)
+        found = self._entities.get(function)
+        if found is None:
+            if len(self._entities) >= REMEMBERED:
+                return self.others
+            found = Entity(TASK, None, '', None, -1, 0, '')
+            found.address = self.others.address
+            self._entities[function] = found
+        return found
 
 
 def make_task(

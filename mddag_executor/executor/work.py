@@ -5,15 +5,17 @@ The unit of work: one execution of a callback, which a user-defined callback gro
 
 Theory of operation
 -------------------
-The core implements rclpy's two kinds of callback groups.  Any other group is asked, as by rclpy's
+The core implements rclpy's two kinds of callback groups.  A mutually exclusive group is also told
+of each execution, and may refuse it: other executors may run callbacks of it, for example because
+a node was moved while its callback ran.  Any other group is asked, as by rclpy's
 executors: ``can_execute`` and ``beginning_execution`` before a callback, and ``ending_execution``
 after it.  This is user code, which may wait for a lock.  So the worker that is to run the callback
 asks, without the engine's lock.
 
 Each entity of such a group is a group of one in the core (rule 4).  Its execution leaves that
 group as soon as it may run.  So the group is asked about an entity's messages one at a time, in
-their order.  A refused execution waits; the group is asked again after each callback that ends,
-and every few milliseconds during a spin.
+their order.  A refused execution of either kind waits; the group is asked again after each
+callback that ends, and every few milliseconds during a spin.
 """
 
 from __future__ import annotations

@@ -49,10 +49,10 @@ import weakref
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core.queues import TURN_NS
+from mddag_executor.core.tables import NEVER
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     END_S,
-    GUARD_NS,
     MOST,
     MOST_YIELD_NS,
     REJOIN_NS,
@@ -295,8 +295,7 @@ class WorkerPool:
             return
         running = current.running
         if running is not None and running.pool is self and running.is_short():
-            if not self.guard.is_set:
-                self._guard(self.now - self._offset)
+            self._guard(self.now - self._offset)
         elif self.engine.may_start_more(self.now):
             self._wake_one()
         elif self.engine.holders and self.engine.idle_workers and self.engine.has_waiting:
@@ -304,11 +303,13 @@ class WorkerPool:
 
     def _guard(self, now: int) -> None:
         """Let a thread start what waits if a short callback runs longer than expected."""
-        guard = self.guard
-        if self.engine.idle_workers and not guard.is_set and not (
-                self.polling and self.loop.timer.at <= now + 2 * GUARD_NS):
+        guard, rest = self.guard, self.engine.patience()
+        if self.engine.holders:
+            rest //= 2  # then it is not known yet whether that computes
+        if self.engine.idle_workers and guard.at > now + rest and not (
+                self.polling and self.loop.timer.at <= now + 2 * rest):
             self._guarded = None if self._leader is None else self._leader.work
-            guard.set(now + GUARD_NS)
+            guard.set(now + rest)
 
     def _guard_expired(self) -> None:
         """
@@ -323,7 +324,7 @@ class WorkerPool:
             if not self.running:
                 return
             if (leader is not None and leader.is_short() and leader.work is not self._guarded
-                    and self.engine.waits_since(now) > now - GUARD_NS):
+                    and self.engine.waits_since(now) > now - self.engine.patience()):
                 self._leader = leader
                 self._guard(now - self._offset)
             elif self.engine.may_start_more(now):
@@ -398,6 +399,10 @@ class WorkerPool:
         """
         self.pause()
         with self.lock:
+            if not self._closed:
+                for work in self.engine.begun():  # it never goes on
+                    if work.entity.exclusive is not None:
+                        work.entity.exclusive.ending_execution(work.entity.rclpy)
             self._closed = True
             self._release_parked()
             threads = list(self._threads)
@@ -639,7 +644,7 @@ class WorkerPool:
                 due.check_holder(now - self._offset)
         if is_short:
             self._leader = me
-            if not self.guard.is_set:
+            if self.guard.at == NEVER:
                 if not self.polling:
                     self._admit()
                 elif not holds and engine.has_waiting:
@@ -683,7 +688,7 @@ class WorkerPool:
         """Run the thread's execution until it ends or waits."""
         work: Any = me.work
         entity = work.entity
-        habit, gate = entity.habit, entity.gate
+        habit, gate, group = entity.habit, entity.gate, entity.exclusive
         must_check = not self.is_current or (
             entity.may_be_gone and work.ready_ns != self.now)  # else it was just checked
         measurement = None
@@ -693,10 +698,19 @@ class WorkerPool:
         me.published = 0
         start = monotonic_ns()
         try:
+            if group is not None and work.coroutine is None and (
+                    not group.beginning_execution(entity.rclpy)):
+                raise Refused
             me.outcome = (
                 work.step(must_check) if gate is None else gate(work, must_check))
+        except Refused as error:
+            me.outcome = error
+            return
         except BaseException as error:
             me.outcome = error
+        if group is not None and (
+                me.outcome is None or isinstance(me.outcome, BaseException)):
+            group.ending_execution(entity.rclpy)
         end = monotonic_ns()
         me.start, me.end = start + self._offset, end + self._offset
         if (measurement is None and not me.published

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The engine by itself, without threads and clocks; its invariants, each broken once."""
 
+import threading
+
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
@@ -11,7 +13,7 @@ from mddag_executor.core.tally import counts
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import GilHabit
+from mddag_executor.executor.gil import GilCheck, GilHabit
 from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Work
 from msg_graph import loads
@@ -424,6 +426,22 @@ def test_a_holder_that_takes_longer_than_usual_is_overtaken_when_the_engine_says
     if now < at:
         assert engine.dispatch(1, at - 1) is None
     assert engine.dispatch(1, max(at, now)) is not None
+
+
+@pytest.mark.parametrize('deadline, most', [('20ms', 0.8), ('5ms', 0.6), ('1s', 4)])
+def test_what_is_urgent_waits_less_for_a_callback_that_was_expected_to_end(deadline, most):
+    """And it is checked as much sooner whether one that it may not overtake computes."""
+    task_set = loads(graph(n=f'name: a, subscription: /a, period: 1s, deadline: {deadline}'))
+    engine = new_engine(task_set, workers=2)
+    entity = entity_of(engine, task_set, 0, 0)
+    assert engine.patience() == 4 * MS
+    engine.arrived(Work(entity, print), None, 0, -1, 0)
+    assert engine.patience() == most * MS
+    check = GilCheck()
+    check.begin(engine, 0, 2 * MS, engine.patience() // 2)
+    assert check.at == 2 * MS
+    check.waits(threading.get_ident(), threading.get_native_id(), 2 * MS)
+    assert check.at == 2 * MS + engine.patience() // 2
 
 
 class Twin:

@@ -18,6 +18,7 @@ from rclpy.callback_groups import (
     MutuallyExclusiveCallbackGroup,
     ReentrantCallbackGroup,
 )
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from rclpy.timer import Rate
@@ -244,7 +245,8 @@ def test_a_response_makes_no_task(make_executor, make_node):
     cancelled = client.call_async(Trigger.Request())
     cancelled.cancel()
     assert not client._pending_requests
-    assert executor._task_entity.ready == 0
+    tasks = executor._task_entities
+    assert not any(each.ready for each in (tasks.others, *tasks._entities.values()))
 
 
 def test_tasks_nodes_and_entities_wake_an_idle_executor(make_executor, make_node, spinning):
@@ -290,6 +292,81 @@ def test_mutually_exclusive_group_is_kept(make_executor, make_node):
         for _ in range(3):
             publisher.publish(Header())
         assert wait_for(lambda: len(ran) == 18)
+
+
+class Moved:
+    """
+    A node with a timer whose group lets one callback run, in whichever executor.
+
+    :ivar begun: how many have begun; ``most`` ran at once.
+    """
+
+    def __init__(self, node, group=None):
+        self.node = node
+        self.begun, self.running, self.most = 0, 0, 0
+        self.leave = threading.Event()
+        self._lock = threading.Lock()
+        node.create_timer(0.01, self.tick, group)
+
+    def tick(self):
+        with self._lock:
+            self.begun += 1
+            self.running += 1
+            self.most = max(self.most, self.running)
+        assert self.leave.wait(15.0)
+        with self._lock:
+            self.running -= 1
+
+
+@pytest.mark.parametrize('kind', ['own', 'rclpy'])
+def test_a_mutually_exclusive_group_is_kept_though_its_node_moves(
+        make_executor, make_node, ros_context, kind):
+    """Its callback runs in one executor, ours or rclpy's, and the next one in another."""
+    first = make_executor() if kind == 'own' else MultiThreadedExecutor(2, context=ros_context)
+    second, moved = make_executor(), Moved(make_node())
+    with Spinning(first), Spinning(second):
+        first.add_node(moved.node)
+        assert wait_for(lambda: moved.begun == 1)
+        first.remove_node(moved.node)
+        second.add_node(moved.node)
+        assert wait_for(lambda: second.statistics()['queue'] or moved.begun > 1)
+        moved.leave.set()
+        assert wait_for(lambda: moved.begun > 3)
+    assert moved.most == 1
+
+
+def test_a_mutually_exclusive_group_is_kept_though_two_executors_run_it(make_executor, make_node):
+    group = MutuallyExclusiveCallbackGroup()
+    moved = Moved(make_node(), group)
+    other = make_node('other')
+    other.create_timer(0.01, moved.tick, group)
+    executors = [make_executor(nodes=[node]) for node in (moved.node, other)]
+    with Spinning(executors[0]), Spinning(executors[1]):
+        assert wait_for(lambda: any(each.statistics()['queue'] for each in executors))
+        moved.leave.set()
+        assert wait_for(lambda: moved.begun > 10)
+    assert moved.most == 1
+
+
+def test_a_group_is_free_when_an_executor_ends_before_its_coroutine(make_executor, make_node):
+    """It never goes on, so another executor may run the others of its group."""
+    node, begun = make_node(), []
+    future = Future()
+
+    async def wait():
+        begun.append(1)
+        await future
+
+    timer = node.create_timer(0.01, wait)
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        assert wait_for(lambda: begun)
+    timer.cancel()
+    executor.remove_node(node)
+    moved = Moved(node, timer.callback_group)
+    moved.leave.set()
+    with Spinning(make_executor(nodes=[node])):
+        assert wait_for(lambda: moved.begun > 1)
 
 
 class Tokens(CallbackGroup):

@@ -10,8 +10,10 @@ import threading
 import time
 
 from mddag_executor.executor import publishing
+from mddag_executor.executor.compat import function_of_task
 from msg_graph import loads
 import pytest
+from rclpy.action import ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -288,6 +290,53 @@ def test_others_wait_for_a_callback_that_goes_on(make_executor, make_node):
         lending.leave.set()
         assert wait_for(lambda: len(lending.ran) == 4)
     assert lending.ran == ['lends', 'goes on', 'ends', 'patient']
+
+
+@pytest.mark.parametrize('is_async', [False, True])
+def test_a_task_holds_the_gil_if_its_function_does(make_executor, make_node, is_async):
+    """That is learnt of each function: tasks that wait do not change it."""
+    lending, is_long = Lending(make_executor, make_node, 7, patient='120s'), threading.Event()
+    executor = lending.executor
+
+    def computes():
+        compute(5)
+        if is_long.is_set():
+            lending.ran.append('task')
+            lending.compute()
+
+    async def computes_later():
+        computes()
+
+    function = computes_later if is_async else computes
+    habit = executor._task_entities.of(function, ()).habit
+    with Spinning(executor):
+        for _ in range(200):
+            tasks = executor.create_task(function), executor.create_task(time.sleep, 0.005)
+            assert wait_for(lambda tasks=tasks: all(task.done() for task in tasks))
+            if habit.is_known and habit.holds:
+                break
+        is_long.set()
+        executor.create_task(function)
+        assert wait_for(lambda: lending.ran == ['task'])
+        lending.wait_in_queue('patient')
+        lending.leave.set()
+        assert wait_for(lambda: lending.ran == ['task', 'patient'])
+
+
+def test_goals_of_an_action_are_told_apart_by_their_callback():
+    """A server runs them all by one method of its own."""
+    servers = [ActionServer._execute_goal.__get__(each) for each in (object(), object())]
+
+    def one(goal):
+        pass
+
+    async def other(goal):
+        pass
+
+    found = [function_of_task(server, (callback, object()))
+             for server in servers for callback in (one, partial(other), one)]
+    assert found == [one.__code__, other.__code__, one.__code__] * 2
+    assert function_of_task([].append, ()) != function_of_task([].remove, ())
 
 
 def test_workers_that_wait_for_a_callback_do_not_keep_it_waiting(make_executor, make_node):

@@ -118,7 +118,8 @@ may not check
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-True]'),
         every=True),
     Case('groups_ignored', [(
-        'executor/entity.py', 'self.group = group', 'self.group = -1')], of(
+        'executor/entity.py', 'self.group = group', 'self.group = -1'), (
+        'executor/registry.py', 'entity.exclusive = group', 'pass')], of(
         'test_executor.py', 'test_mutually_exclusive_group_is_kept')),
     Case('rad_is_fifo', [(
         'core/policies.py', "Policy('rad', key_rad,", "Policy('rad', key_fifo,")], of(
@@ -144,6 +145,17 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_gil.py', 'test_others_wait_for_a_callback_that_goes_on',
         'test_a_callback_that_has_lent_its_worker_goes_on_in_order[1]',
         'test_a_callback_that_has_lent_its_worker_goes_on_in_order[7]'), every=True),
+    Case('groups_of_other_executors_ignored', [(
+        'executor/registry.py', 'entity.exclusive = group', 'pass')], of(
+        'test_executor.py',
+        'test_a_mutually_exclusive_group_is_kept_though_its_node_moves[own]',
+        'test_a_mutually_exclusive_group_is_kept_though_its_node_moves[rclpy]',
+        'test_a_mutually_exclusive_group_is_kept_though_two_executors_run_it'), every=True),
+    Case('tasks_hold_nothing', [(
+        'executor/tasks.py', 'found.address = self.others.address',
+        'found.address = self.others.address; found.habit.is_declared = True')], of(
+        'test_gil.py', 'test_a_task_holds_the_gil_if_its_function_does[False]',
+        'test_a_task_holds_the_gil_if_its_function_does[True]'), every=True),
     Case('those_that_go_on_wait_for_ever', [(
         'executor/workers.py', 'self._go_on_without(work)', 'pass')], of(
         'test_gil.py', 'test_workers_that_wait_for_a_callback_do_not_keep_it_waiting')),
