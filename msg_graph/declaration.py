@@ -16,7 +16,15 @@ from itertools import chain
 from msg_graph.duration import format_duration
 from msg_graph.errors import Collector, did_you_mean, for_each, listed, shown
 from msg_graph.include import as_text, read, resolve
-from msg_graph.language import CALLBACK_KEYS, Entry, FILE, NODE_KEYS, PATH_KEYS, TRIGGERS
+from msg_graph.language import (
+    CALLBACK_KEYS,
+    Entry,
+    FILE,
+    NO_DEADLINE,
+    NODE_KEYS,
+    PATH_KEYS,
+    TRIGGERS,
+)
 from msg_graph.model import Callback, Path, Process, TaskSet
 from msg_graph.yamltext import Tree
 import yaml
@@ -122,10 +130,13 @@ def _callback(entry: Entry, node: str, top: str, entries: dict[str, Entry]) -> C
         topics=(entry.get(kind),) if kind == 'subscription' else entry.get('sync'),
         service=entry.get('service'),
         period_ns=_period(entry, timer_period),
-        deadline_ns=entry.get('deadline'),
+        deadline_ns=None if entry.get('deadline') == NO_DEADLINE else entry.get('deadline'),
+        judged=entry.get('deadline') != NO_DEADLINE,
+        publishes=_publishes(entry), may_publish=entry.get('may_publish'),
         **{same: entry.get(same) for same in (
-            'publishes', 'reads', 'release_from', 'group', 'dag', 'execution_time', 'on_late',
-            'max_active_jobs', 'holds_interpreter', 'keep', 'importance', 'tolerate')},
+            'reads', 'release_from', 'group', 'dag', 'execution_time', 'on_late',
+            'max_active_jobs', 'holds_interpreter', 'keep', 'importance', 'tolerate', 'once',
+            'sporadic')},
         line=entry.line,
         file=None if entry.file == top else entry.file)
     other = entries.setdefault(key, entry)
@@ -134,6 +145,19 @@ def _callback(entry: Entry, node: str, top: str, entries: dict[str, Entry]) -> C
         raise entry.error('name', f'this name is taken in {where}{other.line}',
                           'give each callback of a node a name of its own')
     return callback
+
+
+def _publishes(entry: Entry) -> tuple[str, ...]:
+    """Return all topics of a callback, those that it publishes only sometimes last."""
+    always: tuple[str, ...] = entry.get('publishes')
+    sometimes: tuple[str, ...] = entry.get('may_publish')
+    for topic in sometimes:
+        if topic in always:
+            raise entry.error(
+                'may_publish', f"{shown(topic)} is under 'publishes:' as well",
+                "keep it under 'publishes:' if each execution publishes it, else under "
+                "'may_publish:'", item=topic)
+    return always + sometimes
 
 
 def _period(entry: Entry, timer_period: int | None) -> int | None:

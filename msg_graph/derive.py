@@ -26,8 +26,8 @@ Rules 1, 2, 3 and 6 concern callbacks (``_Links``), the others make vertices.
    only vertices of one DAG: two sources joined by a sync are an error. So every vertex leads back
    to exactly one source, and each weakly connected component is the vertices of one source.
 6. A *sink* is a callback that starts no other callback. By rule 4, either all vertices of a
-   callback are sinks or none is. Each sink has a deadline, shorter or longer than the period; no
-   other callback has one.
+   callback are sinks or none is. Each sink has a deadline, shorter or longer than the period, or
+   says that it has none; no other callback has one.
 7. DAGs are numbered in the order of their sources in the file; the vertices of a DAG in the order
    of their callbacks in the file, those of one callback in the order of the publishers' vertices.
    The edges of a vertex follow the order of the topics that it publishes, those of one topic the
@@ -176,6 +176,16 @@ class _Links:
         if callback.kind == 'timer' and callback.release_from == 'source_timestamp':
             raise error('release_from', 'a timer is released when it is due',
                         "remove 'release_from:', or start the callback by a subscription")
+        if callback.once and callback.kind != 'timer':
+            raise error('once', 'only a timer can fire once',
+                        "remove 'once:'; a source that comes now and then has 'sporadic: true'")
+        if callback.sporadic and callback.kind == 'timer':
+            raise error('sporadic', 'a timer has a fixed period',
+                        "remove 'sporadic:'; a timer that fires once has 'once: true'")
+        if not callback.judged and (callback.tolerate or callback.importance != 'normal'):
+            key = 'tolerate' if callback.tolerate else 'importance'
+            raise error(key, 'it has no deadline that could be missed',
+                        f"remove '{key}:', or give it a deadline")
         if callback.kind == 'sync' and is_source:
             raise error('period', 'a sync callback joins topics, so it cannot be a source',
                         "remove 'period:' and declare the publishers of its topics")
@@ -205,12 +215,14 @@ class _Links:
                              f'this callback starts {shown(after)} by {shown(topic)}',
                              "move it to the sinks after it, or read that topic by a queue edge "
                              "('reads:')")
+        elif not callback.judged:
+            pass
         elif callback.deadline_ns is None and without is not None:
             without.append(callback.key)
         elif callback.deadline_ns is None:
             raise self.entries[callback.key].error(
                 None, 'it is a sink (it starts no other callback) and has no deadline',
-                "add 'deadline:'")
+                "add 'deadline:', or 'deadline: none' if nothing depends on when it ends")
 
     def _check_keys(
         self, callback: Callback, may_be: tuple[str, ...], why: str, remedy: str
@@ -404,7 +416,7 @@ def _dag(
     return Dag(
         name=name, index=index, period_ns=first.period_ns, vertices=tuple(vertices),
         source=next(v.index for v in members if v.callback == source),
-        sinks=tuple(v.index for v in vertices if not v.successors),
+        sinks=tuple(v.index for v in vertices if not v.successors and v.callback.judged),
         edges=tuple((v.index, after) for v in vertices for after in sorted(v.successors)),
         release_from=first.release_from, on_late=first.on_late,
         max_active_jobs=first.max_active_jobs)

@@ -10,14 +10,17 @@ The rules are the same for live runs and recordings. Observations are counts by 
 1. *publishes*: a callback published a topic that it does not declare. Topics of the client library
    do not count.
 2. *rate* of a source: the mean time between two releases differs from the declared period by more
-   than ``TOLERANCE`` of it. At least ``LEAST`` releases are needed.
+   than ``TOLERANCE`` of it. At least ``LEAST`` releases are needed. A sporadic source may be
+   released less often.
 3. *rate* of a subscription: it received messages more or less often than the callbacks that
    publish them ran here, by more than ``TOLERANCE``. At least ``LEAST`` expected messages are
    needed. Dropped messages count as received: their loss is no fault of the declaration. Syncs
-   are not checked, because a declaration does not say how messages are joined.
+   are not checked, because a declaration does not say how messages are joined. A topic that a
+   callback may publish (``may_publish``) has only an upper bound, and its subscribers may never
+   run.
 4. *never ran*: a callback never ran and got nothing, or a sync never got one of its topics, but
-   should have run at least twice. The report suggests an undeclared entity that may be meant
-   (``binding.suggest_entity``).
+   should have run at least twice. Callbacks after a sporadic source need not run. The report
+   suggests an undeclared entity that may be meant (``binding.suggest_entity``).
 5. A callback may run in another process if all its DAGs may span processes (``release_from:
    header_stamp``) or the declaration has ``processes:``, and its node was not seen here. Then it
    is not reported.
@@ -34,7 +37,7 @@ from typing import Any
 from msg_graph.binding import Entity, is_background, suggest_entity
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
-from msg_graph.model import Callback, Dag, legs_of, TaskSet, topological_order
+from msg_graph.model import Callback, Dag, legs_of, optional_edges, TaskSet, topological_order
 
 TOLERANCE = 0.2
 LEAST = 10
@@ -173,6 +176,8 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
     if observed.duration_ns < 2 * slowest + latest:
         return None
     due = _due_by_runs(callback, dags, observed)
+    if _may_never_start(callback, dags):
+        return None
     if topic is None and (observed.got.get(callback.key, 0) or due is not None and due < 2):
         return None     # the callbacks before it, or its own executions, were late or dropped
     text = (f'{callback.key} never {"ran" if topic is None else f"got a message of {topic}"} in '
@@ -189,7 +194,7 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
     if releases.count < LEAST:
         return None
     mean = releases.mean_ns()
-    if abs(mean - period) <= TOLERANCE * period:
+    if abs(mean - period) <= TOLERANCE * period or callback.sporadic and mean > period:
         return None
     return Drift('rate', callback.key, None, period, mean,
                  printable(f'{callback.key} was released every {format_duration(mean)}, and '
@@ -212,11 +217,32 @@ def _message_rate(callback: Callback, dags: list[Dag], observed: Observed) -> Dr
     got = observed.got.get(callback.key, 0)
     # The last release of each DAG may still be in progress.
     if expected is None or expected < LEAST or (
-            abs(got - expected) <= TOLERANCE * expected + len(dags)):
+            abs(got - expected) <= TOLERANCE * expected + len(dags)) or (
+            got < expected and _may_never_start(callback, dags)):
         return None
     return Drift('rate', callback.key, None, expected, got,
                  printable(f'{callback.key} got {got} messages, and by the declaration '
                            f'{expected} were due'))
+
+
+def _may_never_start(callback: Callback, dags: Sequence[Dag]) -> bool:
+    """
+    Return whether a callback need not run by its declaration.
+
+    That is the case if each path to it has a sporadic source or a topic that is published
+    sometimes.
+    """
+    for dag in dags:
+        certain = [False] * len(dag.vertices)
+        certain[dag.source] = not dag.sporadic
+        for index in topological_order(dag):
+            vertex = dag.vertices[index]
+            if certain[index] and vertex.callback.key == callback.key:
+                return False
+            maybe = {after for after, _ in optional_edges(vertex, dag.vertices)}
+            for after in vertex.successors:
+                certain[after] |= certain[index] and after not in maybe
+    return bool(dags)
 
 
 def _first(task_set: TaskSet, suspects: Mapping[str, Drift]) -> list[str]:

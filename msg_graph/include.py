@@ -49,7 +49,7 @@ MOST_DEPTH = 16
 LONGEST_VALUE = 4_096
 _ARGUMENT_USE = re.compile(r'\$\(([^()]*)\)')
 _NUMBER = re.compile(r'[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?|true|false')
-_NAMED = ('node', 'subscription', 'service', 'sync', 'publishes', 'reads')
+_NAMED = ('node', 'subscription', 'service', 'sync', 'publishes', 'may_publish', 'reads')
 
 Chain = list[tuple[str, str]]
 """The including files, the first one first: real path, and name in errors."""

@@ -326,6 +326,13 @@ def _truth(text: str) -> bool:
     return text == 'true'
 
 
+NO_DEADLINE = 'none'
+
+
+def _deadline(text: str) -> int | str:
+    return NO_DEADLINE if text == NO_DEADLINE else parse_duration(text, minimum_ns=MICROSECOND)
+
+
 def _weakly_hard(text: str) -> WeaklyHard:
     found = _OF.fullmatch(text)
     if found is None or not 0 < int(found[1]) < int(found[2]):
@@ -406,6 +413,9 @@ def _mapping(keys: dict[str, Key]) -> Schema:
 
 
 _TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, what='true or false')
+_FLAG = scalar(_truth, _TRUTH.schema, False, what='true or false')
+_DEADLINE = scalar(_deadline, {'anyOf': [time().schema, {'enum': [NO_DEADLINE]}]},
+                   what="a time, as '100ms', or none")
 _WEAKLY_HARD = scalar(_weakly_hard, {
     'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}', 'examples': ['1 of 100']})
 _VALUES = table(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}), ARGUMENT)
@@ -457,13 +467,18 @@ CALLBACK_KEYS = {
     'name': Key(name(CALLBACK), 'Name of the callback, unique in its node.', needed=True),
     **TRIGGERS,
     'period': Key(time(), 'Time between two releases of a source that is not a timer.'),
-    'publishes': Key(_TOPICS, 'The topics that it publishes.'),
+    'publishes': Key(_TOPICS, 'The topics that it publishes in each execution.'),
+    'may_publish': Key(_TOPICS, 'Further topics, which it publishes only in some executions.'),
     'reads': Key(many(scalar(_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
                       different=True),
                  'Queue edges: topics that it takes messages from, and callbacks of its node '
                  'whose variables it reads. They never start it.'),
-    'deadline': Key(time(), 'Relative deadline of a sink, counted from the release of its DAG.',
-                    of=('sink',)),
+    'deadline': Key(_DEADLINE, 'Relative deadline of a sink, counted from the release of its DAG; '
+                    'none: it is not judged.', of=('sink',)),
+    'once': Key(_FLAG, 'Whether a timer fires only once, as it is cancelled in its callback.',
+                of=('source',)),
+    'sporadic': Key(_FLAG, 'Whether the period of a source is only the least time between two '
+                    'releases.', of=('source',)),
     'release_from': Key(choice('arrival', 'source_timestamp', 'header_stamp', missing='arrival'),
                         'Where the release time of a source comes from.', of=('source',)),
     'execution_time': Key(_EXECUTION_TIME, 'Its execution time: constant, or quantiles.'),

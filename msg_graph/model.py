@@ -96,9 +96,10 @@ class Callback:
     :ivar topics: the topics that start it: one for a subscription, two or more for a sync.
     :ivar service: the service that it serves, or None.
     :ivar period_ns: of a source, the period of its DAG, declared or its timer's; else None.
-    :ivar publishes: topics that it publishes.
+    :ivar publishes: topics that it publishes, including those of ``may_publish``, which come last.
+    :ivar may_publish: topics that it publishes only in some of its executions.
     :ivar reads: topics and callbacks of its node whose data it reads later (queue edges).
-    :ivar deadline_ns: of a sink, its relative deadline; else None.
+    :ivar deadline_ns: of a judged sink, its relative deadline; else None.
     :ivar release_from: where a source's release time comes from.
     :ivar group: name of its mutually exclusive callback group within the node, or None.
     :ivar dag: of a source, the declared name of its DAG, or None.
@@ -112,6 +113,10 @@ class Callback:
         when the next job's is ready.
     :ivar importance: of a sink, in an overload.
     :ivar tolerate: of a sink: how many deadline misses are tolerated, or None.
+    :ivar judged: of a sink: False if it has no deadline to be judged by (``deadline: none``).
+    :ivar once: of a timer: whether it fires only once.
+    :ivar sporadic: of a source that is no timer: whether ``period_ns`` is only the least time
+        between two releases.
     :ivar file: name of the file that declares it; None: that of the task set.
     """
 
@@ -137,6 +142,10 @@ class Callback:
     keep: Keep = 'all'
     importance: Importance = 'normal'
     tolerate: WeaklyHard | None = None
+    may_publish: tuple[str, ...] = ()
+    judged: bool = True
+    once: bool = False
+    sporadic: bool = False
     file: str | None = None
 
 
@@ -152,7 +161,8 @@ class Vertex:
     :ivar predecessors: indices, in the DAG, of the vertices that start it, ascending.
     :ivar successors: indices, in the DAG, of the vertices that it starts, in the order of the
         topics that it publishes, those of one topic ascending.
-    :ivar deadline_ns: relative deadline; not None if and only if it is a sink.
+    :ivar deadline_ns: relative deadline of a sink; None for other vertices, and for a sink that
+        declares ``deadline: none``.
     """
 
     name: str
@@ -173,7 +183,8 @@ class Dag:
     :ivar index: its index among the DAGs, in the order of the sources in the file.
     :ivar period_ns: time between two releases.
     :ivar source: index of the one vertex with no predecessor.
-    :ivar sinks: indices of the vertices with no successor, ascending.
+    :ivar sinks: indices of the vertices with a deadline, ascending: those with no successor,
+        except those that declare ``deadline: none``.
     :ivar edges: trigger edges as pairs of indices, ascending.
     :ivar release_from: where a job's release time comes from; for a timer it is its due time, and
         ``header_stamp`` is the release in other processes of the DAG.
@@ -191,6 +202,21 @@ class Dag:
     release_from: ReleaseFrom
     on_late: OnLate | None
     max_active_jobs: int | None
+
+    @property
+    def once(self) -> bool:
+        """Return whether it has one job only, as its source is a timer that fires once."""
+        return self.vertices[self.source].callback.once
+
+    @property
+    def sporadic(self) -> bool:
+        """Return whether the period is only the least time between two releases."""
+        return self.vertices[self.source].callback.sporadic
+
+    def jobs_in(self, duration_ns: int) -> int:
+        """Return the number of releases in a time, if the first one is at its begin."""
+        jobs = -(-duration_ns // self.period_ns)
+        return min(1, jobs) if self.once else jobs
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,6 +354,18 @@ def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]
         if topic in vertices[before].callback.publishes]
 
 
+def optional_edges(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, str]]:
+    """
+    Return the vertices that an execution may leave unstarted, as it publishes only sometimes.
+
+    :return: pairs of a successor's index and a topic; the successor is not due in a job in which
+        this vertex completes without publishing the topic.
+    """
+    return [(after, topic) for after in vertex.successors
+            for topic in vertices[after].callback.topics
+            if topic in vertex.callback.may_publish]
+
+
 def path_lengths(dag: Dag, weights: Sequence[int]) -> list[int]:
     """
     Return for each vertex the length of the longest path from the source through it.
@@ -355,10 +393,10 @@ def load_of(dag: Dag) -> float | None:
     """
     Return the load of the DAG in cores, with mean execution times: sum(C) / T.
 
-    None if an execution time is not declared.
+    None if an execution time is not declared; 0 for a DAG that has one job only.
     """
     means = mean_execution_times(dag)
-    return None if means is None else sum(means) / dag.period_ns
+    return 0.0 if dag.once else None if means is None else sum(means) / dag.period_ns
 
 
 NO_GRAPH = TaskSet((), (), (), (), None, '', '')

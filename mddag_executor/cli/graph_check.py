@@ -110,7 +110,7 @@ def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any
         'period_ns': dag.period_ns,
         'vertices': [vertex.name for vertex in dag.vertices],
         'edges': [list(edge) for edge in dag.edges],
-        'sinks': {dag.vertices[i].name: dag.vertices[i].deadline_ns for i in dag.sinks},
+        'sinks': {v.name: v.deadline_ns for v in dag.vertices if not v.successors},
         'rad_offset_ns': rad_offsets,
         'critical_path_ns': None if means is None else max(path_lengths(dag, means)),
         'load': load,
@@ -121,7 +121,7 @@ def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any
 def _backlog(dag: Dag, load: float | None) -> Iterator[str]:
     """Yield that jobs of a DAG can pile up, if they can and nothing bounds them."""
     source = dag.vertices[dag.source].callback
-    latest = max(dag.vertices[sink].deadline_ns or 0 for sink in dag.sinks)
+    latest = max((dag.vertices[sink].deadline_ns or 0 for sink in dag.sinks), default=0)
     if (load is not None and load > _BACKLOG_LOAD and latest > dag.period_ns
             and source.keep != 'newest' and dag.max_active_jobs is None):
         yield (f"{dag.name}: its deadline is longer than its period, and it needs {load:.2f} "
@@ -160,7 +160,7 @@ def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
             None if path is None else format_ns(path),
             None if load is None else f'{load:.4f}']
         for sink, deadline in dag['sinks'].items():
-            yield [*of_dag, short[sink], format_ns(deadline)]
+            yield [*of_dag, short[sink], 'none' if deadline is None else format_ns(deadline)]
 
 
 def _tests(result: dict[str, Any]) -> Iterator[str]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from mddag_executor.core.state import (
     ABORTED,
+    COMPLETED,
     ELSEWHERE,
     EXPIRED,
     FREE,
@@ -19,6 +20,7 @@ from mddag_executor.core.state import (
     JOB_END,
     JUDGE_FROM,
     JUDGE_UNTIL,
+    LATE,
     LEADS_OUT,
     NOT_JUDGED,
     OPEN,
@@ -28,6 +30,8 @@ from mddag_executor.core.state import (
     SINK_DROPPED,
     SINK_IN_TIME,
     SINK_MISSED,
+    SINK_NOT_DUE,
+    SINK_OVERDUE,
     SKIP,
     State,
     URGENCY,
@@ -145,9 +149,11 @@ def is_miss(kind: int) -> bool:
     return SINK_IN_TIME < kind < JOB_END
 
 
-def judge(s: State, slot: int, kind: int, vertex: int, deadline: int, time: int) -> None:
-    """Decide the result of a job at a sink, if the job is judged (rule 6)."""
-    if is_judged(s, slot):
+def judge(
+    t: Tables, s: State, slot: int, kind: int, vertex: int, deadline: int, time: int
+) -> None:
+    """Decide the result of a job at a sink, if both are judged (rule 6)."""
+    if t.judged[vertex] != 0 and is_judged(s, slot):
         s.decisions.append(
             (kind, s.job_dag[slot], vertex, s.job_index[slot], deadline, time))
 
@@ -209,7 +215,7 @@ def judge_incomplete(
     """
     Judge the incomplete sinks of an open job with deadlines after a time up to another one.
 
-    :return: their number.
+    :return: the number of judged ones.
     """
     dag = s.job_dag[slot]
     found = 0
@@ -217,10 +223,19 @@ def judge_incomplete(
         vertex = t.sinks[i]
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
         if after < deadline <= until and (
-                s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0):
-            judge(s, slot, kind, vertex, deadline, -1)
-            found += 1
+                s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0) and (
+                kind != SINK_OVERDUE or is_due(t, s, slot, vertex)):
+            judge(t, s, slot, kind, vertex, deadline, -1)
+            found += t.judged[vertex]
     return found
+
+
+def is_due(t: Tables, s: State, slot: int, vertex: int) -> bool:
+    """Return whether a sink is known to be due: all its gates were opened (rule 15)."""
+    for i in range(t.first_gate[vertex], t.first_gate[vertex + 1]):
+        if s.x_state[s.job_base[slot] + t.gates[i]] == IDLE:
+            return False
+    return True
 
 
 def finish(t: Tables, s: State, now: int) -> None:
@@ -238,11 +253,39 @@ def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
     if s.x_pending[head] < 0:
         return
     s.x_pending[head] = -1
-    judge(s, slot, SINK_DROPPED, vertex, s.job_release[slot] + t.sink_deadline[vertex], -1)
-    s.job_late[slot] += 1
+    judge(t, s, slot, SINK_DROPPED, vertex, s.job_release[slot] + t.sink_deadline[vertex], -1)
+    s.job_late[slot] += t.judged[vertex]
     s.job_sinks_left[slot] -= 1
     if s.job_sinks_left[slot] == 0:
         close_job(s, slot, OUTDATED, now)
+
+
+def withhold(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
+    """
+    Note that no message starts a vertex of an open job (rule 15).
+
+    The vertex and all after it are not due in this job: a sync among them lacks a leg for good.
+    A driver calls this before it reports the end of the execution that has not published.
+    """
+    base = s.job_base[slot]
+    after = [vertex]
+    while len(after) > 0:
+        v = after.pop()
+        head = base + t.region_offset[v]
+        elsewhere = s.expected[v] == ELSEWHERE
+        if s.x_pending[head] < (-1 if elsewhere else 0):
+            continue  # it has completed, or is known not to be due
+        s.x_pending[head] = -2 if elsewhere else -1
+        for i in range(t.first_successor[v], t.first_successor[v + 1]):
+            after.append(t.successors[i])
+        if elsewhere:
+            continue
+        if t.sink_deadline[v] >= 0:
+            judge(t, s, slot, SINK_NOT_DUE, v, s.job_release[slot] + t.sink_deadline[v], -1)
+        if t.sink_deadline[v] >= 0 or s.expected[v] == LEADS_OUT:
+            s.job_sinks_left[slot] -= 1
+    if s.job_sinks_left[slot] == 0:
+        close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
 
 
 def next_deadline(t: Tables, s: State, slot: int, after: int) -> int:

@@ -286,4 +286,4 @@ def _announce_demoted(t: Tables, s: State, slot: int, vertex: int, now: int) -> 
     job = s.job_index[slot]
     if s.job_state[slot] == OPEN and s.x_demoted[head] != job and s.x_pending[head] >= 0:
         s.x_demoted[head] = job
-        judge(s, slot, SINK_DEMOTED, vertex, s.job_release[slot] + t.sink_deadline[vertex], now)
+        judge(t, s, slot, SINK_DEMOTED, vertex, s.job_release[slot] + t.sink_deadline[vertex], now)

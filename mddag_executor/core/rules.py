@@ -97,6 +97,11 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     demoted as if it were late (rule 7), and nothing more.  A sink counts as late for
     ``LATE_PATIENCE`` of its relative deadlines.  Of too much demand the least importance is
     demoted, as many levels as necessary, but never the highest.
+15. **Not due.**  A vertex may publish some of its topics only sometimes.  If it completes without
+    one of them, the vertices that the topic leads to, and all after these, are not due in the job
+    (``withhold``): a sync needs all of its legs.  They get no verdict, and the job does not wait
+    for them.  Until it is known that a sink is due it is not overdue (``is_due``); if its job
+    expires or fails before, it is missed.  Sinks without a deadline are never judged.
 """
 
 from __future__ import annotations
@@ -598,8 +603,8 @@ def _complete_vertex(
     late = False
     if is_sink:
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
-        late = now > deadline
-        judge(s, slot, SINK_LATE if late else SINK_IN_TIME, vertex, deadline, now)
+        late = now > deadline and t.judged[vertex] != 0
+        judge(t, s, slot, SINK_LATE if late else SINK_IN_TIME, vertex, deadline, now)
         if late:
             s.job_late[slot] += 1
             note_late(t, s, slot, vertex, now)

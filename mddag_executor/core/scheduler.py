@@ -106,6 +106,11 @@ class Scheduler:
         if self.state.job_state[slot] == OPEN:
             jobs.give_up(self.tables, self.state, slot, end, now)
 
+    def withhold(self, slot: int, vertex: int, now: int) -> None:
+        """Note that no message starts a vertex of the job in a slot (``core.jobs.withhold``)."""
+        if self.state.job_state[slot] == OPEN:
+            jobs.withhold(self.tables, self.state, slot, vertex, now)
+
     def expire_idle(self, now: int) -> None:
         """Expire every job that can no longer complete."""
         for dag in range(self.tables.n_dags):

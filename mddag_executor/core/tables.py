@@ -31,6 +31,15 @@ execution time, ``height`` the number of edges on the longest path to a sink.
 * ``importance``: the highest of the sinks that it leads to, over trigger and queue edges.
 ``tolerated``, ``tolerated_of``: of a sink with ``tolerate: m of k``, else 0.
 
+``is_optional``, next to ``successors``: 1 if the edge becomes true only in some jobs, because its
+topic is one that the vertex may publish.  ``gates``, from ``first_gate`` of a sink on: the
+executions, as offsets in the region of a job, that such edges on its paths start; the sink is due
+when all of them are known to start.
+
+``judged``: 0 for a sink without a deadline (``deadline: none``).  It is ordered as if it had one
+of ``UNJUDGED_PERIODS`` periods: behind nearly everything that has a deadline, and it never
+starves.
+
 ``process`` is the number of the declared process that a callback runs in, from 1.
 
 For policies that order callbacks, not jobs:
@@ -51,7 +60,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from msg_graph import Callback, Dag, TaskSet, Vertex
-from msg_graph.model import legs_of, path_lengths, topological_order
+from msg_graph.model import legs_of, optional_edges, path_lengths, topological_order
 
 NEVER = 2 ** 62
 """A time that is never reached, ns: larger than any clock, small enough to add to."""
@@ -62,6 +71,11 @@ MAX_ACTIVE_JOBS = 64
 """How many jobs of a DAG may be open at a time."""
 EXPIRE_AFTER_NS = 1_000_000_000
 """An idle job expires this long after its latest deadline, ns."""
+
+UNJUDGED_PERIODS = 10
+"""A sink without a deadline is ordered as if it had one of so many periods of its DAG, …"""
+UNJUDGED_NS = 1_000_000_000
+"""… and at least this long."""
 
 CONTINUE, DEMOTE, ABORT = range(3)
 KEEP_ALL, KEEP_TIMELY, KEEP_NEWEST = range(3)
@@ -80,9 +94,9 @@ class Tables(NamedTuple):
     """
     Columns of a task set, immutable while a run lasts.
 
-    All times are in nanoseconds.  Lists are indexed by DAG (``period``, ``dag_deadline``, …) or by
-    global vertex index (``rad_offset``, ``dag_of``, …); the last DAG and the last vertex are the
-    undeclared ones.
+    All times are in nanoseconds; the period of a DAG that has one job only is NEVER.  Lists are
+    indexed by DAG (``period``, ``dag_deadline``, …) or by global vertex index (``rad_offset``,
+    ``dag_of``, …); the last DAG and the last vertex are the undeclared ones.
     """
 
     n_dags: int
@@ -112,6 +126,7 @@ class Tables(NamedTuple):
     tolerated: list[int]
     tolerated_of: list[int]
     sink_deadline: list[int]
+    judged: list[int]
     entity: list[int]
     chain_rank: list[int]
     region_offset: list[int]
@@ -121,6 +136,9 @@ class Tables(NamedTuple):
     n_predecessors: list[int]
     first_successor: list[int]
     successors: list[int]
+    is_optional: list[int]
+    first_gate: list[int]
+    gates: list[int]
     group: list[int]
     process: list[int]
     n_groups: int
@@ -177,6 +195,7 @@ class _Columns:
         self.lists['first_sink'].append(0)
         self.lists['first_successor'].append(0)
         self.lists['first_reach'].append(0)
+        self.lists['first_gate'].append(0)
 
     def enter(self, callbacks: Sequence[Callback]) -> None:
         """Assign each declared callback its index in the wait set."""
@@ -189,6 +208,7 @@ class _Columns:
         first = len(lists['dag_of'])
         reached = reached_sinks(dag)
         heights = [0] * len(dag.vertices)
+        maybe = [optional_edges(vertex, dag.vertices) for vertex in dag.vertices]
         for index in reversed(topological_order(dag)):
             heights[index] = 1 + max((heights[s] for s in dag.vertices[index].successors),
                                      default=-1)
@@ -218,7 +238,8 @@ class _Columns:
             lists['keep'].append(
                 KEEP_NEWEST if vertex.callback.keep == 'newest'
                 else KEEP_TIMELY if vertex.callback.kind == 'timer' else KEEP_ALL)
-            lists['sink_deadline'].append(-1 if vertex.deadline_ns is None else vertex.deadline_ns)
+            lists['sink_deadline'].append(-1 if vertex.successors else leaf_deadline(vertex, dag))
+            lists['judged'].append(int(vertex.deadline_ns is not None))
             lists['entity'].append(self._entities[vertex.callback.key])
             lists['region_offset'].append(region)
             lists['n_legs'].append(len(topics))
@@ -226,19 +247,40 @@ class _Columns:
             lists['leg_topic'].extend(topics)
             lists['n_predecessors'].append(countdown)
             lists['successors'].extend(first + s for s in reversed(vertex.successors))
+            starts_sometimes = {after for after, _ in maybe[vertex.index]}
+            lists['is_optional'].extend(
+                int(after in starts_sometimes) for after in reversed(vertex.successors))
             lists['first_successor'].append(len(lists['successors']))
             lists['group'].append(self._group(vertex.callback.node, vertex.callback.group))
             region += len(topics)
-        lists['period'].append(dag.period_ns)
-        lists['dag_deadline'].append(max(dag.vertices[s].deadline_ns or 0 for s in dag.sinks))
+        self._add_gates(dag, first, maybe)
+        lists['period'].append(NEVER if dag.once else dag.period_ns)
+        leaves = [vertex for vertex in dag.vertices if not vertex.successors]
+        judged = [dag.vertices[sink] for sink in dag.sinks]
+        lists['dag_deadline'].append(max(leaf_deadline(v, dag) for v in judged or leaves))
         lists['on_late'].append(self._on_late if dag.on_late is None else ON_LATE[dag.on_late])
         lists['max_active_jobs'].append(dag.max_active_jobs or self._max_active_jobs)
         lists['expire_after'].append(self._expire_after)
         lists['first_vertex'].append(first)
         lists['n_region'].append(region)
         lists['source'].append(first + dag.source)
-        lists['sinks'].extend(first + s for s in dag.sinks)
+        lists['sinks'].extend(first + vertex.index for vertex in leaves)
         lists['first_sink'].append(len(lists['sinks']))
+
+    def _add_gates(self, dag: Dag, first: int, maybe: list[list[tuple[int, str]]]) -> None:
+        """Add the gates of the vertices of a DAG."""
+        gates: list[set[int]] = [set() for _ in dag.vertices]
+        for index in topological_order(dag):
+            for after, topic in maybe[index]:
+                vertex = dag.vertices[after]
+                leg = legs_of(vertex, dag.vertices).index(
+                    (vertex.callback.topics.index(topic), index)) if self._legs else 0
+                gates[after].add(self.lists['region_offset'][first + after] + leg)
+            for after in dag.vertices[index].successors:
+                gates[after] |= gates[index]
+        for of_vertex in gates:
+            self.lists['gates'].extend(sorted(of_vertex))
+            self.lists['first_gate'].append(len(self.lists['gates']))
 
     def _group(self, node: str, group: str | None) -> int:
         if group is None or self._legs:
@@ -255,11 +297,11 @@ class _Columns:
             'latest_start': default_deadline, 'first_reach': len(lists['reach_sink']),
             'keep': KEEP_ALL, 'mean_time': 0, 'height': 0,
             'importance': IMPORTANT, 'tolerated': 0, 'tolerated_of': 0,
-            'sink_deadline': -1,
+            'sink_deadline': -1, 'judged': 0,
             'entity': self._n_entities, 'region_offset': 0,
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
-            'group': -1, 'process': 1,
+            'first_gate': len(lists['gates']), 'group': -1, 'process': 1,
             'period': default_deadline, 'dag_deadline': default_deadline, 'on_late': self._on_late,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
             'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),
@@ -330,6 +372,13 @@ def rad_offsets(dag: Dag) -> list[int]:
     return [min(deadline for _, deadline, _ in sinks) for sinks in reached_sinks(dag)]
 
 
+def leaf_deadline(vertex: Vertex, dag: Dag) -> int:
+    """Return the relative deadline by which a vertex without successors is ordered, ns."""
+    if vertex.deadline_ns is None:
+        return max(UNJUDGED_PERIODS * dag.period_ns, UNJUDGED_NS)
+    return vertex.deadline_ns
+
+
 def mean_time(vertex: Vertex) -> int:
     """Return the declared mean execution time, ns; 0 if none is declared."""
     declared = vertex.callback.execution_time
@@ -344,7 +393,7 @@ def reached_sinks(dag: Dag) -> list[list[tuple[int, int, int]]]:
         ``latest_start`` in the theory of operation; it may be negative), ns.
     """
     costs = [mean_time(vertex) for vertex in dag.vertices]
-    deadlines = [NEVER if vertex.deadline_ns is None else vertex.deadline_ns
+    deadlines = [NEVER if vertex.successors else leaf_deadline(vertex, dag)
                  for vertex in dag.vertices]
     starts: list[dict[int, int]] = [{} for _ in dag.vertices]
     for index in reversed(topological_order(dag)):

@@ -33,6 +33,7 @@ from mddag_executor.core.state import (
     SINK_IN_TIME,
     SINK_LATE,
     SINK_MISSED,
+    SINK_NOT_DUE,
     SINK_OVERDUE,
 )
 from mddag_executor.core.tables import NEVER, Tables
@@ -57,7 +58,8 @@ class Counts(NamedTuple):
     """
     Verdicts about the jobs of one or several sinks; ``late`` includes the overdue.
 
-    Demoted jobs have another verdict, too.
+    Demoted jobs have another verdict as well.  Jobs in which the sink was not due are not among
+    the ``due``.
     """
 
     due: int
@@ -68,6 +70,7 @@ class Counts(NamedTuple):
     failed: int
     dropped: int
     demoted: int
+    not_due: int
 
     @property
     def missed(self) -> int:
@@ -91,7 +94,7 @@ def counts(sink: Mapping[str, Any]) -> Counts:
     in_time = sink['completed'] - (sink['late'] - overdue)
     due = sink['completed'] + overdue + sink['expired'] + aborted + failed + dropped
     return Counts(due, in_time, sink['late'], sink['expired'], aborted, failed, dropped,
-                  sink.get('demoted', 0))
+                  sink.get('demoted', 0), sink.get('not_due', 0))
 
 
 def is_kept(sink: Mapping[str, Any]) -> bool:
@@ -148,7 +151,7 @@ class SinkTally:
 
     def __init__(self, relative_deadline_ns: int, keep: int | None) -> None:
         self.relative_deadline_ns = relative_deadline_ns
-        self.numbers = [0] * (SINK_DEMOTED + 1)
+        self.numbers = [0] * (SINK_NOT_DUE + 1)
         self.shortest, self.longest = NEVER, -NEVER
         self.responses: Any = deque(maxlen=keep)
 
@@ -172,7 +175,8 @@ class SinkTally:
             'completed': self.completed, 'late': numbers[SINK_LATE] + overdue, 'overdue': overdue,
             'expired': numbers[SINK_EXPIRED], 'failed': numbers[SINK_FAILED],
             'aborted': numbers[SINK_ABORTED], 'dropped': numbers[SINK_DROPPED],
-            **({'demoted': numbers[SINK_DEMOTED]} if numbers[SINK_DEMOTED] else {})}
+            **({'demoted': numbers[SINK_DEMOTED]} if numbers[SINK_DEMOTED] else {}),
+            **({'not_due': numbers[SINK_NOT_DUE]} if numbers[SINK_NOT_DUE] else {})}
 
     def result(self) -> dict[str, Any]:
         """Return the sink's part of the result."""
@@ -198,7 +202,8 @@ class Tally:
         self._dags = task_set.dags if task_set is not None else ()
         self.jobs = [0] * tables.n_dags
         self.ends = [dict.fromkeys(OUTCOMES, 0) for _ in range(tables.n_dags)]
-        self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks}
+        self.sinks = {v: SinkTally(tables.sink_deadline[v], keep) for v in tables.sinks
+                      if tables.judged[v]}
         #: By sink: its misses in any window, if the declaration tolerates some.
         self.windows = {v: MissWindow(tolerate.of) for v in self.sinks
                         if (tolerate := self._tolerate(v)) is not None}
@@ -288,7 +293,7 @@ class Tally:
 
     def _sinks_of(self, dag: int) -> list[int]:
         first = self._tables.first_sink
-        return self._tables.sinks[first[dag]:first[dag + 1]]
+        return [v for v in self._tables.sinks[first[dag]:first[dag + 1]] if v in self.sinks]
 
     def vertex_name(self, vertex: int) -> str:
         """Return the name of a global vertex."""

@@ -11,9 +11,10 @@ pool.  The thread does not take the engine's lock.  It reads counters while they
 that it misses shows one period later.
 
 A DAG's status is about its recent results (jobs of its sinks).  STALE: no job has been released
-for a while.  ERROR, WARN: see ``Thresholds``.  The pool's status is WARN when data was lost:
-messages beyond a queue's depth, releases of timers, messages whose job was not found, events of
-the trace, misses for which ``on_deadline_miss`` was too slow.
+for a while, and the DAG is neither sporadic nor released only once.  ERROR, WARN: see
+``Thresholds``.  The pool's status is WARN when data was lost: messages beyond a queue's depth,
+releases of timers, messages whose job was not found, events of the trace, misses for which
+``on_deadline_miss`` was too slow.
 
 By the conventions of diagnostics names are ``NAME: DAG`` and ``NAME: workers``, the hardware_id is
 the host's name and the process, and values are texts with the unit in their keys.
@@ -88,6 +89,8 @@ class DagWatch:
         self._thresholds = thresholds
         self._in_stops = in_stops
         self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
+        # whether silence is no sign of trouble
+        self._is_quiet = dag.once or dag.sporadic
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
         # the counters at the end of each period of the window, and before it
         self._seen = deque([self._read()], maxlen=thresholds.window + 1)
@@ -135,11 +138,12 @@ class DagWatch:
         self, step: Counts, window: Counts, now: int, in_stops: int
     ) -> tuple[int, str]:
         limits = self._thresholds
-        if self._released_at is None:
-            return STALE, 'nothing has been released yet'
-        silent = now - self._released_at
-        if silent >= self._stale_after:
-            return STALE, f'nothing has been released for {silent / 1e9:.1f} s'
+        if not self._is_quiet:
+            if self._released_at is None:
+                return STALE, 'nothing has been released yet'
+            silent = now - self._released_at
+            if silent >= self._stale_after:
+                return STALE, f'nothing has been released for {silent / 1e9:.1f} s'
         if not window.missed:
             return OK, f'{counted(window.due, "result")} in time'
         message = f'{window.missed} of {window.due} results missed their deadlines'

@@ -65,6 +65,7 @@ from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
 from mddag_executor.trace.groups import EXECUTION
 from mddag_executor.trace.schema import GOES_ON
 from msg_graph import TaskSet
+from msg_graph.model import optional_edges
 
 if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
@@ -98,6 +99,14 @@ class Engine:
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
+        # by vertex: the vertices that it may start, each with the topic that does
+        self._optional_edges: dict[int, list[tuple[int, str]]] = {}
+        for dag in task_set.dags if task_set else ():
+            first = self.tables.first_vertex[dag.index]
+            for vertex in dag.vertices:
+                if several := optional_edges(vertex, dag.vertices):
+                    self._optional_edges[first + vertex.index] = [
+                        (first + after, topic) for after, topic in several]
         admit(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.jobs, process)
@@ -663,6 +672,8 @@ class Engine:
         self._let_go(work)
         origin, record = work.origin, self.record
         entity.failed += failed
+        if origin is not None and origin.vertex in self._optional_edges:
+            self._withhold(origin, failed, end)
         if self.verdicts.tally.overdue and origin is not None:
             deadline = self.verdicts.tally.overdue.get((origin.vertex, origin.job), -1)
             if end <= deadline:  # it was reported overdue before this was known
@@ -686,6 +697,18 @@ class Engine:
             self._record_run(work, start, end, vtid, worker)
         if self._state.decisions:
             self._decided(now)
+
+    def _withhold(self, origin: Origin, failed: bool, now: int) -> None:
+        """Leave out of a job what an execution that ends might have started, but has not."""
+        slot, _, _, vertex = origin
+        pending = self._state.x_pending[self.scheduler.execution(slot, vertex)]
+        if pending > 1:
+            return  # a leg of a sync that was not the last
+        published = self.jobs.published(origin)
+        if not failed and pending >= 0:
+            for after, topic in self._optional_edges[vertex]:
+                if topic not in published:
+                    self.scheduler.withhold(slot, after, now)
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""

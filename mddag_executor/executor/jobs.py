@@ -32,7 +32,7 @@ from time import time_ns
 from typing import Any, NamedTuple
 
 from mddag_executor.clocks import TraceClock
-from mddag_executor.executor.bounds import MOST
+from mddag_executor.executor.bounds import MOST, REMEMBERED
 from msg_graph import TaskSet
 
 ROUNDING_NS = 2
@@ -196,9 +196,12 @@ class Topic:
     """The publications of one trigger topic."""
 
     __slots__ = (
-        'publications', 'announced', 'is_announced', 'open', 'to_announce', 'lock', 'on_header')
+        'publications', 'announced', 'is_announced', 'open', 'to_announce', 'lock', 'on_header',
+        'is_optional')
 
-    def __init__(self) -> None:
+    def __init__(self, is_optional: bool) -> None:
+        # whether a callback publishes it only sometimes
+        self.is_optional = is_optional
         self.publications: deque[Publication] = deque(maxlen=MOST)
         self.announced: deque[Publication] = deque(maxlen=4 * MOST)
         self.is_announced = False
@@ -219,8 +222,11 @@ class Jobs:
     """
 
     def __init__(self, task_set: TaskSet | None) -> None:
-        topics = {t for c in task_set.callbacks for t in c.publishes} if task_set else set()
-        self.topics = {t: Topic() for t in topics}
+        callbacks = task_set.callbacks if task_set else ()
+        optional = {t for c in callbacks for t in c.may_publish}
+        self.topics = {t: Topic(t in optional) for c in callbacks for t in c.publishes}
+        # by DAG, job and vertex: the optional topics that its executions have published
+        self._published: dict[tuple[int, int, int], set[str]] = {}
         self._release_from = [d.release_from for d in task_set.dags] if task_set else []
         self.unknown = 0
         self.doubtful = 0
@@ -234,6 +240,8 @@ class Jobs:
         """Send a message and note the publication; the caller holds the publisher's lock."""
         if topic.on_header is not None:
             topic.on_header(header_stamp(msg), origin)
+        if topic.is_optional and origin is not NO_ORIGIN:
+            self._note_optional(state.topic, origin)
         publication = Publication(time_ns(), state.numbers, origin, state.count)
         interrupted, state.sending = state.sending, publication
         if interrupted is not None:  # by a signal handler: the order of the numbers is unknown
@@ -252,6 +260,17 @@ class Jobs:
             if is_announced:
                 self._announce_when_alone(send, state.topic, topic, publication)
         return publication
+
+    def _note_optional(self, topic: str, origin: Origin) -> None:
+        published = self._published
+        published.setdefault((origin.dag, origin.job, origin.vertex), set()).add(topic)
+        if len(published) > 2 * REMEMBERED:  # of jobs that ended before these vertices completed
+            for key in list(published)[:REMEMBERED]:
+                published.pop(key, None)
+
+    def published(self, origin: Origin) -> set[str]:
+        """Return, and forget, the optional topics that a vertex has published in a job."""
+        return self._published.pop((origin.dag, origin.job, origin.vertex), set())
 
     def _announce_when_alone(
         self, send: Callable[[Any, Any], None], name: str, topic: Topic, publication: Publication

@@ -16,13 +16,19 @@ ResponseTimes = TypedDict(  # noqa: UP013 - a class would shadow min and max
 """Response times of a sink from the release on; quantiles are those of the last 2,000."""
 
 
-class Demotions(TypedDict, total=False):
-    """Jobs of a sink that were put behind others; only with ``on_late: demote``."""
+class RareCounts(TypedDict, total=False):
+    """
+    Counts that are only there if they are not 0.
+
+    ``demoted``: jobs of a sink that were put behind others, with ``on_late: demote``; ``not_due``:
+    jobs in which nothing was published that would have started it (``may_publish``).
+    """
 
     demoted: int
+    not_due: int
 
 
-class SinkCounts(Demotions):
+class SinkCounts(RareCounts):
     """
     The results of a sink.
 

@@ -21,6 +21,7 @@ from mddag_executor.core.state import (
     SINK_FAILED,
     SINK_IN_TIME,
     SINK_LATE,
+    SINK_NOT_DUE,
     SINK_OVERDUE,
 )
 from mddag_executor.core.stops import LEAST_NS, Stops
@@ -103,7 +104,7 @@ class Verdicts:
                 if self.record is not None:
                     self.record('demote', now, threading.get_native_id(), dag,
                                 self._tables.index_in_dag[vertex], job)
-            elif kind != SINK_IN_TIME:
+            elif kind not in (SINK_IN_TIME, SINK_NOT_DUE):
                 self._missed(kind, dag, vertex, job, deadline, time, now)
         self.tally.add(decisions)  # last: it knows which sinks were overdue before
         return dropped

@@ -125,7 +125,7 @@ def utilisations(task_set: TaskSet, times: Times, workers: int) -> Floats:
     """Return each run's normalised utilisation: sum of execution time over period, by workers."""
     total = np.zeros(len(times))
     for dag, of_dag in _by_dag(task_set, times):
-        total += of_dag.sum(axis=1) / dag.period_ns
+        total += 0.0 if dag.once else of_dag.sum(axis=1) / dag.period_ns
     return total / workers
 
 
@@ -167,6 +167,7 @@ def feasible(
                     late &= lengths[index] + overheads + latest < duration_ns
                 possible &= ~late
             jobs = max(0, (duration_ns - offsets[index]) // dag.period_ns + 1)
+            jobs = min(1, jobs) if dag.once else jobs
             demand += float(jobs) * of_dag[:, index]
     return possible & (demand <= float(workers) * duration_ns) if horizon else possible
 
@@ -185,6 +186,6 @@ def _waiting(
         for callback in task_set.callbacks)
     work = np.zeros(len(times))
     for dag, of_dag in _by_dag(task_set, times):
-        work += -(-duration_ns // dag.period_ns) * (of_dag + 2 * overhead_ns).sum(axis=1)
+        work += dag.jobs_in(duration_ns) * (of_dag + 2 * overhead_ns).sum(axis=1)
     waiting: Floats = work / (1 if shared else workers)
     return waiting

@@ -109,7 +109,7 @@ def _check(experiments: Sequence[Experiment], runs: int, first_run: int) -> None
 def plain_s(experiments: Sequence[Experiment], runs: int) -> float:
     """Return about how long all runs take with the plain core, one at a time."""
     vertex_jobs = sum(
-        -(-experiment.duration_ns // dag.period_ns) * len(dag.vertices)
+        dag.jobs_in(experiment.duration_ns) * len(dag.vertices)
         for experiment in experiments for dag in experiment.task_set.dags)
     return vertex_jobs * len(experiments[0].policies) * PLAIN_S * runs
 

@@ -14,7 +14,8 @@ at once; ``test/replay/test_deadlines.py`` compares both implementations.
    or failed.  Later completions do not count.
 3. A sink that completed by its absolute deadline is in time, later it is late.  If the job ended
    before, the sink gets the verdict of that end.  If the run ended after the deadline, the sink is
-   overdue.
+   overdue.  A sink is not due, and gets no verdict, if a vertex before it completed without
+   publishing a topic of ``may_publish`` that leads to it.
 4. Jobs released before ``judge_from`` or outside ``judged_releases`` are not judged.
 5. A change of the vertices that a process expects (``hosted``) applies to jobs released after it.
 
@@ -48,6 +49,7 @@ from mddag_executor.core.state import (
     SINK_IN_TIME,
     SINK_LATE,
     SINK_MISSED,
+    SINK_NOT_DUE,
 )
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
@@ -64,6 +66,7 @@ from mddag_executor.recording.tables import (
     Table,
 )
 from mddag_executor.text import counted
+from msg_graph.model import optional_edges, topological_order
 import numpy as np
 import numpy.typing as npt
 
@@ -121,6 +124,7 @@ class Judged:
         self._recording, self.task_set, self.skip = recording, task_set, skip
         self.tables = Tables.build(task_set, legs=True)
         self.contradictions = 0
+        self._not_due: dict[int, int] = {}
         self._outcomes: list[tuple[int, Ints, Mask]] = []
         #: The first release that is judged.
         self.judge_from = _judge_from(recording, skip)
@@ -169,18 +173,22 @@ class Judged:
         local = np.array(sinks, dtype=np.int64) - first
         here = expected[:, local] == HERE if expected is not None else \
             np.ones((len(released), len(local)), dtype=np.bool_)
+        withheld = self._withheld(dag, jobs, position)[:, local]
         order = position[:, local]
-        done = order < jobs.ended[:, None]
+        done = (order < jobs.ended[:, None]) & (order < withheld)
+        not_due = here & ~done & (withheld < jobs.ended[:, None])
         deadline = jobs.release[:, None] + np.array(
             [self.tables.sink_deadline[sink] for sink in sinks], dtype=np.int64)
         completed = np.full(done.shape, -1)
         completed[done] = self._recording.executions['end'][jobs.done[:, local][done]]
-        late = done & (completed > deadline)
+        is_judged = np.array([self.tables.judged[sink] for sink in sinks], dtype='?')
+        late = done & (completed > deadline) & is_judged
         dropped, dropped_at = self._dropped(jobs, sinks)
-        dropped &= here & ~done & ((reason < 0)[:, None] | (dropped_at <= jobs.until[:, None]))
+        dropped &= here & ~done & ~not_due & (
+            (reason < 0)[:, None] | (dropped_at <= jobs.until[:, None]))
         # position at which the last sink completed
-        closed = np.where(here & ~dropped, np.where(done, order, NEVER), -1).max(
-            axis=1, initial=-1)
+        ended_at = np.where(done, order, np.where(not_due, withheld, NEVER))
+        closed = np.where(here & ~dropped, ended_at, -1).max(axis=1, initial=-1)
         if expected is not None:
             done_here = np.where(position < jobs.ended[:, None], position, NEVER)
             closed = np.maximum(closed, np.where(
@@ -190,13 +198,15 @@ class Judged:
         ended = np.minimum(jobs.ended, closed)
         judged_order, judged_until = self._recording.judged_order, self._recording.judged_until
         open_then = (jobs.released < judged_order) & (ended > judged_order)
-        overdue = here & ~dropped & (order > judged_order) & open_then[:, None] & (
+        overdue = here & ~dropped & (ended_at > judged_order) & open_then[:, None] & (
             deadline <= judged_until) if self._recording.judged else np.zeros_like(done)
-        given_up = here & ~done & ~dropped & (jobs.ended < NEVER)[:, None] & (
+        given_up = here & ~done & ~dropped & ~not_due & (jobs.ended < NEVER)[:, None] & (
             reason != recorded.WITHDRAWN)[:, None]
         self.contradictions += int((duplicates[0] < ended[duplicates[1]]).sum())
         self._late_ends(jobs, ends, ended)
         judged = self._is_judged(jobs.release)
+        for place, sink in enumerate(sinks):
+            self._not_due[sink] = int((not_due[:, place] & judged).sum())
         kinds = np.full(len(jobs.release), SINK_MISSED)
         for of, (_, kind) in _ENDS.items():
             kinds[reason == of] = kind
@@ -207,10 +217,11 @@ class Judged:
             (dropped, SINK_DROPPED, np.minimum(jobs.ended, at_end)[:, None], dropped_at),
             (overdue, SINK_MISSED, at_end, judged_until))
         verdicts = [
-            _verdicts(dag, sinks, jobs, deadline, completed, which & judged[:, None], *columns)
+            _verdicts(dag, sinks, jobs, deadline, completed,
+                      which & judged[:, None] & is_judged, *columns)
             for which, *columns in choices]
         outcome: Ints = np.where(
-            ((late & here) | overdue | dropped).any(axis=1), LATE, COMPLETED)
+            ((late & here) | (overdue | dropped) & is_judged).any(axis=1), LATE, COMPLETED)
         for of, (end, _) in _ENDS.items():
             outcome[(jobs.ended <= closed) & (reason == of)] = end
         over = (ended < NEVER) & ~((jobs.ended <= closed) & (reason == recorded.WITHDRAWN))
@@ -231,6 +242,40 @@ class Judged:
                 dropped[row[row >= 0], place] = True
                 when[row[row >= 0], place] = mine['time'][row >= 0]
         return dropped, when
+
+    def _withheld(self, dag: int, jobs: Jobs, position: Ints) -> Ints:
+        """
+        Return by job and vertex the position from which on it is known not to be due (NEVER: due).
+
+        That is the position at which a vertex completed that has not published (rule 3).
+        """
+        vertices = self.task_set.dags[dag].vertices
+        found = np.full(position.shape, NEVER)
+        if not any(vertex.callback.may_publish for vertex in vertices):
+            return found
+        for v in topological_order(self.task_set.dags[dag]):
+            vertex = vertices[v]
+            maybe = optional_edges(vertex, vertices)
+            for after, topic in maybe:
+                silent = np.where(self._published(dag, v, topic, jobs), NEVER, position[:, v])
+                np.minimum(found[:, after], silent, out=found[:, after])
+            for after in vertex.successors:
+                np.minimum(found[:, after], found[:, v], out=found[:, after])
+        return found
+
+    def _published(self, dag: int, vertex: int, topic: str, jobs: Jobs) -> Mask:
+        """Return by job whether a vertex has published a topic."""
+        recording = self._recording
+        sent, publishers = recording.publications, recording.who.every_publisher
+        numbers = [number for number, each in publishers.items() if each.topic == topic]
+        by = sent['execution'][np.isin(sent['publisher'], numbers)]
+        by = by[by >= 0]
+        ran = recording.executions
+        mine = by[ran['vertex'][by] == self.tables.first_vertex[dag] + vertex]
+        published = np.zeros(len(jobs.number), dtype=np.bool_)
+        row = jobs.rows_of(ran['job'][mine])
+        published[row[row >= 0]] = True
+        return published
 
     def _given_up(self, jobs: Jobs, ends: Table) -> Ints:
         """Note when jobs ended early; return the reason."""
@@ -362,8 +407,9 @@ class Judged:
         tally.add_results(*(self.verdicts[name] for name in (
             'kind', 'sink', 'job', 'deadline', 'completed')))
         demoted = Counter(demotions['vertex'].tolist())
-        for v in self.tables.sinks:
+        for v in tally.sinks:
             tally.sinks[v].numbers[SINK_DEMOTED] = demoted[v]
+            tally.sinks[v].numbers[SINK_NOT_DUE] = self._not_due[v]
         return tally
 
     @cached_property

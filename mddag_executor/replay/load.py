@@ -62,7 +62,7 @@ from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import edge_numbers, FAILS, RUNS, SKIPPED
 from msg_graph import Dag
-from msg_graph.model import topological_order
+from msg_graph.model import optional_edges, topological_order
 import numpy as np
 
 _UNKNOWN = -1
@@ -305,14 +305,27 @@ class LoadBuilder:
             arrived[rows[early], edge] = published[early]
 
     def _note_publications(self) -> None:
-        """Note which edges the publications of jobs satisfied."""
-        edges_from: dict[tuple[int, str | None], list[int]] = {}
+        """
+        Note which edges the publications of jobs satisfied.
+
+        A sync may have several topics of one publisher, so its edge needs several messages.  Those
+        that are published each time need not be checked if others are published only sometimes.
+        """
+        edges_from: dict[tuple[int, str | None], list[tuple[int, int]]] = {}
+        needed: dict[tuple[int, int], int] = {}
         for dag, first in zip(self._task_set.dags, self._first):
             for vertex in dag.vertices:
+                optional = {(before.index, topic): place for before in dag.vertices
+                            for place, (after, topic) in enumerate(
+                                optional_edges(before, dag.vertices)) if after == vertex.index}
+                several = {before for before, _ in optional}
                 for (place, before), edge in zip(
                         legs_of(vertex, dag.vertices), self._edges_into[first + vertex.index]):
-                    edges_from.setdefault(
-                        (first + before, vertex.callback.topics[place]), []).append(edge)
+                    topic = vertex.callback.topics[place]
+                    bit = 1 << min(7, optional.get((before, topic), 0))
+                    if before not in several or (before, topic) in optional:
+                        edges_from.setdefault((first + before, topic), []).append((edge, bit))
+                        needed[dag.index, edge] = needed.get((dag.index, edge), 0) | bit
         table, sent = self._executions, self._recording.publications
         by = sent['execution']
         by, publisher = by[by >= 0], sent['publisher'][by >= 0]
@@ -320,13 +333,19 @@ class LoadBuilder:
         known = (row >= 0) & (vertex_of >= 0)
         row, vertex_of, publisher = row[known], vertex_of[known], publisher[known]
         publishers = self._recording.who.every_publisher
+        found = np.zeros(len(self._columns['sent']), dtype=np.uint8)
         for number in np.unique(publisher).tolist():
-            topic = publishers[number].topic if number in publishers else None
+            name = publishers[number].topic if number in publishers else None
             mine = publisher == number
             for v in np.unique(vertex_of[mine]).tolist():
                 places = self._places(_EDGE, row[mine & (vertex_of == v)], v)
-                for edge in edges_from.get((v, topic), ()):
-                    self._columns['sent'][places + edge] = 1
+                for edge, bit in edges_from.get((v, name), ()):
+                    found[places + edge] |= bit
+        for (dag_index, edge), bits in needed.items():
+            begin, end = self._begins[_EDGE, dag_index:dag_index + 2]
+            step = int(self._widths[_EDGE, dag_index])
+            sent = self._columns['sent'][begin:end][edge::step]
+            sent[found[begin:end][edge::step] == bits] = 1
 
     def times(self) -> list[list[int]]:
         """Return by DAG and vertex the execution time, 0 if unknown."""
@@ -382,7 +401,10 @@ class LoadBuilder:
         for dag, publishers in enumerate(self._publishers):
             sent, arrived, end = self._of(dag, 'sent', 'arrived', 'end')
             completed = end[:, publishers] >= 0
-            found.append((sent < 0) & (arrived < 0) & completed & (sent >= 0).any(axis=0))
+            first = self._tables.first_successor[self._first[dag]]
+            optional = np.array(self._tables.is_optional[first:first + len(publishers)], dtype='?')
+            known = (sent >= 0).any(axis=0) | optional & (len(self._recording.publications) > 0)
+            found.append((sent < 0) & ((arrived < 0) | optional) & completed & known)
         return found
 
     def _never_ready(self, dag: Dag, unsent: Any) -> Any:

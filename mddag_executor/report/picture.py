@@ -112,7 +112,7 @@ def _box(vertex: Vertex, colour: str) -> Box:
     _, several, number = vertex.name[len(callback.key):].partition('#')
     lines = [callback.name + several + number]
     if callback.kind == 'timer' and callback.timer_period_ns is not None:
-        lines.append(f'timer {format_ns(callback.timer_period_ns)}')
+        lines.append(f'timer {format_ns(callback.timer_period_ns)}' + ', once' * callback.once)
     elif callback.kind == 'sync':
         lines.append(f'sync of {len(callback.topics)}')
     elif callback.kind == 'service':

@@ -91,8 +91,8 @@ def sink_columns(dags: Mapping[str, Any]) -> tuple[list[str], Callable[[Sink], l
                 f'{limit["misses"]} of {limit["of"]}', limit['worst']]
         return row
 
-    return ['due', 'in time', 'late', *rare, 'median', 'p99', 'max', 'deadline',
-            *['tolerates', 'worst'] * tolerates], cells
+    return ['due', 'in time', 'late', *(name.replace('_', ' ') for name in rare),
+            'median', 'p99', 'max', 'deadline', *['tolerates', 'worst'] * tolerates], cells
 
 
 def worst_first(dags: Mapping[str, Any]) -> list[Sink]:
@@ -107,7 +107,8 @@ def missed_share(verdicts: Counts) -> float:
 
 def rare_ends(every: Counts) -> list[str]:
     """Return the counts that are only shown if they are not 0."""
-    return [name for name in ('failed', 'aborted', 'dropped', 'demoted') if getattr(every, name)]
+    return [name for name in ('failed', 'aborted', 'dropped', 'demoted', 'not_due')
+            if getattr(every, name)]
 
 
 def times(values: Mapping[str, Any] | None, *keys: str) -> list[Cell]:
@@ -142,7 +143,8 @@ def verdicts_text(every: Counts) -> str:
     """Return verdicts as a text."""
     return (f'{counted(every.due, "result")} due, {every.in_time} in time '
             f'({percent(every.in_time, every.due)}), {every.late} late, {every.expired} expired'
-            + ''.join(f', {getattr(every, name)} {name}' for name in rare_ends(every)))
+            + ''.join(f', {getattr(every, name)} {name.replace("_", " ")}'
+                      for name in rare_ends(every)))
 
 
 def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:

@@ -8,7 +8,8 @@ Theory of operation
 If transport takes time, an edge to a successor is satisfied ``delay`` after its vertex completes;
 the core gets each edge by ``rules.edge``.  With a negative delay the callback published before its
 end: the edge is satisfied that long before the end, but not before the start.  With preemption,
-edges are satisfied at the end.  A delay of NEVER means that nothing is published. If executions
+edges are satisfied at the end.  A delay of NEVER means that nothing is published; over an edge
+that its publisher takes only sometimes, the vertex is then not due (rule 15).  If executions
 may be stopped (see ``machine``), the end is not known in advance, but the *place* is: the progress
 of the execution when it publishes.
 
@@ -20,7 +21,7 @@ from __future__ import annotations
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-from mddag_executor.core import rules
+from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import OPEN, PREEMPTIVE, QueueEntry, State
 from mddag_executor.core.tables import NEVER, Tables
@@ -111,6 +112,8 @@ def ends_sending(
     if len(load.fates) > 0 and load.fates[place_of(s, load, x)] == FAILS:
         rules.fail(t, s, key, x, now)
     else:
+        if s.job_state[slot] == OPEN:
+            _withhold_unsent(t, s, load, x, now)
         rules.complete(t, s, key, x, now)
     preemptive = s.scalars[PREEMPTIVE] != 0
     for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
@@ -119,6 +122,14 @@ def ends_sending(
             _arrive(t, s, key, slot, job, t.successors[edge], now)
         elif delay > 0 and (is_used(m) or preemptive):
             _post(s, d, now + delay, x, t.successors[edge])
+
+
+def _withhold_unsent(t: Tables, s: State, load: Load, x: int, now: int) -> None:
+    """Leave out of a job what an execution that ends might have started, but has not."""
+    vertex = s.x_vertex[x]
+    for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
+        if t.is_optional[edge] != 0 and delay_of(t, s, load, x, edge) >= NEVER:
+            jobs.withhold(t, s, s.x_slot[x], t.successors[edge], now)
 
 
 def arrive_due(

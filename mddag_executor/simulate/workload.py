@@ -121,7 +121,8 @@ def _shown(value: object) -> str:
 
 def utilisation(task_set: TaskSet, times: Sequence[Sequence[int]], workers: int) -> float:
     """Return the normalised utilisation: sum of execution time over period, by workers."""
-    total = sum(sum(row) / dag.period_ns for dag, row in zip(task_set.dags, times))
+    total = sum(sum(row) / dag.period_ns for dag, row in zip(task_set.dags, times)
+                if not dag.once)
     return total / workers
 
 
@@ -160,7 +161,7 @@ def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns
     releases = sorted(
         (job * dag.period_ns, dag.index, job)
         for dag in task_set.dags
-        for job in range(-(-duration_ns // dag.period_ns)))
+        for job in range(dag.jobs_in(duration_ns)))
     holds = [number * int(vertex.callback.holds_interpreter or False)
              for number, vertex in zip(processes_of(task_set), task_set.vertices)]
     return Load(

@@ -114,7 +114,7 @@ def _triggers(draw, callbacks):
 @st.composite
 def task_sets(
     draw, /, max_dags=3, max_callbacks=5, groups=True,
-    bounds=True, newest=False, importance=False,
+    bounds=True, newest=False, importance=False, optional=False,
 ):
     """
     Draw a task set: one to some DAGs with AND, OR, unequal deadlines, shared callbacks.
@@ -122,6 +122,7 @@ def task_sets(
     :param groups: some callbacks are in mutually exclusive groups, also across DAGs.
     :param bounds: some DAGs abort or demote late jobs or bound their open jobs.
     :param newest: some sources and sinks keep only the newest.
+    :param optional: some topics are published only sometimes, some sinks have no deadline.
     :param importance: sinks have an importance, and some tolerate misses.
     """
     every = []
@@ -168,6 +169,12 @@ def task_sets(
             if draw(st.booleans()):
                 callback['tolerate'] = f'{draw(st.integers(1, 2))} of {draw(st.integers(3, 5))}'
         callback['publishes'] = sorted(callback['publishes'])
+        if optional:
+            callback['may_publish'] = [t for t in callback['publishes'] if draw(st.booleans())]
+            callback['publishes'] = [
+                t for t in callback['publishes'] if t not in callback['may_publish']]
+            if callback.get('deadline') and draw(st.integers(0, 3)) == 0:
+                callback['deadline'] = 'none'
         del callback['topic']
         if not callback['publishes']:
             del callback['publishes']

@@ -8,7 +8,7 @@ became of it; it knows nothing of slots, heaps and keys but what the scheduler's
 """
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import attrgetter, methodcaller
 
 from hypothesis import strategies as st
@@ -34,6 +34,7 @@ from mddag_executor.core.state import (
     SINK_DROPPED,
     SINK_EXPIRED,
     SINK_FAILED,
+    SINK_NOT_DUE,
     SINK_OVERDUE,
 )
 
@@ -71,6 +72,7 @@ class Job:
     slot: int
     release: int
     end: int | None = None
+    started: set[tuple[int, int]] = field(default_factory=set)
 
 
 # No lambdas: older versions of hypothesis read the source of one whenever they call it.
@@ -81,7 +83,7 @@ ANY_GROUP, HOLDS = st.integers(0, 2), st.booleans()
 class LiveDriver(RuleBasedStateMachine):
     """Messages arrive late or never, threads take, complete, lend and suspend in any order."""
 
-    @initialize(task_set=task_sets(max_dags=2, max_callbacks=4, groups=False),
+    @initialize(task_set=task_sets(max_dags=2, max_callbacks=4, groups=False, optional=True),
                 workers=st.integers(1, 3), policy=st.sampled_from(sorted(POLICIES)))
     def start(self, task_set, workers, policy):
         self.task_set = task_set
@@ -168,6 +170,7 @@ class LiveDriver(RuleBasedStateMachine):
         group = self.groups[group]
         self.state.x_group[x], self.state.x_holds[x] = group, int(holds)
         self.scheduler.ready(x, self.now)
+        job.started.add((vertex, leg))
         self.note(Run(x, (job.dag, job.index), vertex, leg, group, holds))
         self.settle()  # it may have replaced a late one
 
@@ -202,34 +205,48 @@ class LiveDriver(RuleBasedStateMachine):
         assert self.state.worker_x[worker] == x
 
     @precondition(methodcaller('with_fate', RUNNING))
-    @rule(data=st.data(), fails=st.sampled_from([False, False, False, True]))
-    def complete(self, data, fails):
-        self.complete_one(data.draw(st.sampled_from(self.with_fate(RUNNING))), fails)
+    @rule(data=st.data(), fails=st.sampled_from([False, False, False, True]),
+          silent=st.booleans())
+    def complete(self, data, fails, silent):
+        self.complete_one(data.draw(st.sampled_from(self.with_fate(RUNNING))), fails, silent)
 
-    def complete_one(self, run, fails=False):
+    def complete_one(self, run, fails=False, silent=False):
         key = (*run.job, run.vertex)
         self.legs_done[key] += 1
         legs = self.tables.n_legs[run.vertex]
         job = next((job for job in self.jobs if (job.dag, job.index) == run.job), None)
         was_open = job is not None and job.end is None
+        if silent and not fails and job is not None and self.legs_done[key] == legs:
+            for after, _ in self.optional(job.dag, run.vertex):
+                self.scheduler.withhold(job.slot, after, self.now)
         end = self.scheduler.fail if fails else self.scheduler.complete
         whole = end(run.x, self.now)
         assert whole == (self.legs_done[key] == legs)
         run.fate = DONE
         del self.by_x[run.x]
         if whole and job is not None:
-            self.publish(job, run.vertex)
+            self.publish(job, run.vertex, silent and not fails)
         self.settle()
         assert not (fails and was_open) or job.end == FAILED
 
-    def publish(self, job, vertex):
+    def optional(self, dag, vertex):
+        """Return the vertices, with their legs, that a vertex starts only sometimes."""
+        first, vertices = self.tables.first_vertex[dag], self.task_set.dags[dag].vertices
+        me = vertices[vertex - first]
+        return [(first + after, leg) for after in me.successors
+                for leg, (topic, before) in enumerate(legs_of(vertices[after], vertices))
+                if before == me.index
+                and vertices[after].callback.topics[topic] in me.callback.may_publish]
+
+    def publish(self, job, vertex, silent):
         first = self.tables.first_vertex[job.dag]
         dag = self.task_set.dags[job.dag]
         me = dag.vertices[vertex - first]
         for after in me.successors:
             self.messages += [
                 (job, first + after, leg) for leg, (_, before)
-                in enumerate(legs_of(dag.vertices[after], dag.vertices)) if before == me.index]
+                in enumerate(legs_of(dag.vertices[after], dag.vertices)) if before == me.index
+                and not (silent and (first + after, leg) in self.optional(job.dag, vertex))]
 
     @rule(data=st.data())
     def drop(self, data):
@@ -312,13 +329,15 @@ class LiveDriver(RuleBasedStateMachine):
     def judge(self):
         """Each overdue sink is found once, and a deadline to come is never forgotten."""
         due = self.due()
-        expected = {sink for sink, deadline in due.items() if deadline < self.now} - self.overdue
+        passed = {sink for sink, deadline in due.items() if deadline < self.now} - self.overdue
+        jobs = {(job.dag, job.index): job for job in self.open_jobs()}
+        expected = {sink for sink in passed if self.is_certain(jobs[sink[0], sink[2]], sink[1])}
         assert (self.deadlines.next < self.now) >= bool(expected)
         self.deadlines.judge(self.now)
         found = self.scheduler.decisions()
         assert {decision[0] for decision in found} <= {SINK_OVERDUE}
         assert sorted(decision[1:4] for decision in found) == sorted(expected)
-        self.overdue |= expected
+        self.overdue |= passed  # a sink that may still not be due then is judged when it ends
         later = [deadline for deadline in due.values() if deadline >= self.now]
         assert self.now <= self.deadlines.next <= min(later, default=NEVER)
         assert not [*self.deadlines.broken_invariants()]
@@ -329,6 +348,15 @@ class LiveDriver(RuleBasedStateMachine):
                     for sink in self.task_set.dags[job.dag].sinks]
         return {(job.dag, vertex, job.index): job.release + self.tables.sink_deadline[vertex]
                 for job, vertex in vertices if (job.dag, vertex, job.index) not in self.sinks}
+
+    def is_certain(self, job, vertex):
+        """Return whether nothing that is published only sometimes can keep a sink from running."""
+        first = self.tables.first_vertex[job.dag]
+        before = [first + each for each in
+                  self.task_set.dags[job.dag].vertices[vertex - first].predecessors]
+        return all(self.is_certain(job, each) and all(
+            start in job.started for start in self.optional(job.dag, each) if start[0] == vertex)
+            for each in before)
 
     # --- decisions -------------------------------------------------------------------------------
 
@@ -345,7 +373,8 @@ class LiveDriver(RuleBasedStateMachine):
                 assert sink not in self.sinks, 'two verdicts'
                 self.sinks[sink] = kind
                 assert kind in (
-                    *SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_DROPPED)
+                    *SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_DROPPED,
+                    SINK_NOT_DUE)
 
     def dropped(self, decision):
         _, dag, vertex, job, x, now = decision
@@ -363,7 +392,10 @@ class LiveDriver(RuleBasedStateMachine):
         job.end = end
         first = self.tables.first_vertex[dag]
         kinds = [self.sinks[dag, first + sink, index] for sink in self.task_set.dags[dag].sinks]
-        assert all(kind in SINK_COMPLETED for kind in kinds) == (end in (COMPLETED, LATE))
+        ended = all(kind in (*SINK_COMPLETED, SINK_NOT_DUE) for kind in kinds)
+        assert ended >= (end in (COMPLETED, LATE))
+        if len(kinds) == len([v for v in self.task_set.dags[dag].vertices if not v.successors]):
+            assert ended == (end in (COMPLETED, LATE))
 
     # --- what must hold --------------------------------------------------------------------------
 

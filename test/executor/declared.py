@@ -42,7 +42,7 @@ class Declared:
     executions by the name of the callback.
 
     :param bodies: by the name of a callback, the function or coroutine function that it calls
-        before it publishes.
+        before it publishes.  A function may return a frozenset of topics that are not published.
     :param reentrant: whether all callbacks may run at once (but no timer's with itself), or one
         of each node.
     """
@@ -84,15 +84,15 @@ class Declared:
             self.ran[name].append(Ran(
                 int(message.frame_id or -1), header_stamp(message), topic, current_job()))
 
-        def end(message):
+        def end(message, left_out=frozenset()):
             for publisher in publishers:
-                publisher.publish(message)
+                if publisher.topic not in left_out:
+                    publisher.publish(message)
 
         def run(topic, message):
             begin(topic, message)
-            if body is not None:
-                body()
-            end(message)
+            left_out = None if body is None else body()
+            end(message, left_out if isinstance(left_out, frozenset) else frozenset())
 
         async def wait(topic, message):
             begin(topic, message)

@@ -8,7 +8,7 @@ that arrive late or never, coroutines, drops, undeclared callbacks), and records
 records, in the order in which it does: what a thread ran only when it has run.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count
@@ -27,9 +27,11 @@ from mddag_executor.core.state import (
     OPEN,
     SINK_COMPLETED,
     SINK_IN_TIME,
+    SINK_NOT_DUE,
 )
 from mddag_executor.trace import TraceFile
 from msg_graph import loads, TaskSet
+from msg_graph.model import optional_edges
 
 START_TIME = 1_732_166_766_000_000_000
 MS = 1_000_000
@@ -93,8 +95,11 @@ def declarations(draw):
                 start = f'timer: 10ms, dag: dag{d}' + ''.join(
                     key for key in (', on_late: abort', ', max_active_jobs: 2')
                     if draw(st.booleans()))
-            end = f'publishes: [{", ".join(topics)}]' if topics else \
-                f'deadline: {draw(st.integers(3, 30))}ms'
+            end = f'deadline: {draw(st.sampled_from([*range(3, 31), None]))}ms'.replace(
+                'Nonems', 'none')
+            if topics:
+                key = draw(st.sampled_from(['publishes', 'publishes', 'may_publish']))
+                end = f'{key}: [{", ".join(topics)}]'
             add(f'/d{d}n{i}', f'{start}, {end}')
     if shared:
         add('/common', 'subscription: /shared, deadline: 9ms')
@@ -113,6 +118,17 @@ def legs_to(task_set, tables):
                     if before == vertex.index:
                         targets.append((first + after, leg))
     return found
+
+
+def withhold(task_set, scheduler, slot, vertex, published, now):
+    """Leave out of a job what a vertex that completes with this leg has not started."""
+    state, dag = scheduler.state, task_set.vertices[vertex].dag
+    if state.x_pending[scheduler.execution(slot, vertex)] in (0, 1):
+        first = scheduler.tables.first_vertex[dag]
+        for after, topic in optional_edges(
+                task_set.vertices[vertex], task_set.dags[dag].vertices):
+            if topic not in published:
+                scheduler.withhold(slot, first + after, now)
 
 
 def ns(ms):
@@ -173,6 +189,7 @@ class Chances:
     undeclared: float = 0.2
     early_message: float = 0.3
     failed: float = 0.05
+    silent: float = 0.3
 
 
 @dataclass
@@ -185,6 +202,7 @@ class _Execution:
     job: int
     ready: int
     pieces: int = 1
+    silent: frozenset[str] | None = None
 
 
 @dataclass
@@ -214,6 +232,9 @@ class VirtualRun:
         self._targets = legs_to(self.task_set, self.tables)
         self._queue, self._order = [], count()
         self._waiting, self._aborted = {}, set()
+        self._published = defaultdict(set)
+        self._optional = {topic: 9000 + place for place, topic in enumerate(sorted(
+            {topic for each in self.task_set.callbacks for topic in each.may_publish}))}
         self._jobs = [0] * self.tables.n_dags
         self._events = self.drops = 0
         self.file = TraceFile(self.path, overwrite=True)
@@ -222,6 +243,8 @@ class VirtualRun:
     def _run(self):
         self.record('task_set', START_TIME, 1, self.task_set.text, self.task_set.file, self.policy,
                     self.workers, 100 * MS, 3, False)
+        for topic, handle in self._optional.items():
+            self.record('rcl_publisher_init', START_TIME, 1, handle, 0, handle, topic, 10)
         end = START_TIME + self.duration
         for dag in self.task_set.dags:
             for k in range(self.duration // dag.period_ns):
@@ -318,7 +341,13 @@ class VirtualRun:
         self._at(end + self.random.choice((0, 0, 1, 30_000)),
                  lambda locked: self._end(work, worker, start, end, locked))
         if work.vertex >= 0:
+            if work.silent is None:
+                callback = self.task_set.vertices[work.vertex].callback
+                work.silent = frozenset(topic for topic in callback.may_publish
+                                        if self.random.random() < self.chances.silent)
             for vertex, leg in self._targets[work.vertex]:
+                if self._topic(vertex, leg) in work.silent:
+                    continue
                 if self.random.random() >= self.chances.lost:
                     early = self.random.random() < self.chances.early_message
                     arrival = self.random.randrange(start, end + 1) if early \
@@ -333,6 +362,12 @@ class VirtualRun:
         self.record('dispatch', start, vtid, address, work.dag, vertex, work.job, worker,
                     work.ready, 0)
         self.record('callback_start', start, vtid, address, False)
+        if declared:
+            published = self._published[work.dag, work.job, work.vertex]
+            for topic in self.task_set.vertices[work.vertex].callback.may_publish:
+                if topic not in work.silent:
+                    published.add(topic)
+                    self.record('rclcpp_publish', start, vtid, self._optional[topic], 0, 0)
         self.record('callback_end', end, vtid, address)
         if declared:
             key = self.task_set.vertices[work.vertex].callback.key
@@ -346,12 +381,19 @@ class VirtualRun:
         if declared and self.random.random() < self.chances.failed:
             self.scheduler.give_up(work.slot, FAILED, end)
             self.record('fail', now, vtid, work.dag, vertex, work.job)
+        elif declared:
+            withhold(self.task_set, self.scheduler, work.slot, work.vertex, published, end)
         whole = self.scheduler.complete(work.x, end)
         if declared:
             self.executions[key] += 1
             self.record('complete', now, vtid, address, work.dag, vertex, work.job, whole, end,
                         work.leg)
         self.decided(now)
+
+    def _topic(self, vertex, leg):
+        vertex = self.task_set.vertices[vertex]
+        place, _ = legs_of(vertex, self.task_set.dags[vertex.dag].vertices)[leg]
+        return vertex.callback.topics[place]
 
     def _resume(self, work, now):
         work.pieces += 1
@@ -376,7 +418,7 @@ class VirtualRun:
                     self._aborted.add((dag, job))
                 if deadline in (ABORTED, EXPIRED):
                     self.record('abort' if deadline == ABORTED else 'expire', now, 2, dag, job)
-            else:
+            elif kind != SINK_NOT_DUE:
                 if kind in SINK_COMPLETED:
                     self.responses.append(time - deadline + self.tables.sink_deadline[vertex])
                 if kind != SINK_IN_TIME:

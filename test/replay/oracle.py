@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verdicts of a recording by the scheduler core itself, fed event by event."""
 
+from collections import defaultdict
+
 from mddag_executor.core import NEVER, Scheduler, Tables, Tally
 from mddag_executor.core import state as core
 from mddag_executor.core.jobs import is_judged, judge_from
@@ -9,6 +11,8 @@ from mddag_executor.core.rules import complete
 from mddag_executor.core.state import IDLE, JOB_END, OPEN, SKIP
 from mddag_executor.core.tables import CONTINUE
 from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED
+
+from .helpers import withhold
 
 ENDS = {EXPIRED: core.EXPIRED, ABORTED: core.ABORTED, FAILED: core.FAILED}
 _KINDS = ('released', 'completed', 'ended', 'hosted', 'finished')
@@ -30,6 +34,14 @@ class Oracle:
         if recording.judge_from > -NEVER:
             judge_from(self.scheduler.state, recording.judge_from)
         self.slots = {}
+        self.task_set = task_set
+        self.published = defaultdict(set)
+        sent, publishers = recording.publications, recording.who.every_publisher
+        for publisher, by in sent[['publisher', 'execution']].tolist():
+            if by >= 0 and publisher in publishers:
+                ran = recording.executions[by]
+                self.published[int(ran['vertex']), int(ran['job'])].add(
+                    publishers[publisher].topic)
         events = [(order, 0, (dag, job, release, noticed)) for _, dag, job, release, noticed, order
                   in recording.releases.tolist()]
         columns = ('order', 'dag', 'vertex', 'job', 'leg', 'end')
@@ -65,6 +77,8 @@ class Oracle:
             x = self.scheduler.execution(slot, vertex, each)
             if state.x_state[x] == IDLE:
                 state.job_active[slot] += 1     # without ready queue, group and workers
+                withhold(self.task_set, self.scheduler, slot, vertex,
+                         self.published[vertex, job], end)
                 complete(tables, state, self.scheduler.policy.key, x, end)
 
     def ended(self, dag, job, time, reason):
