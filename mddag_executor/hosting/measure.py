@@ -207,8 +207,8 @@ def _judge(ledger: Ledger, dag: Dag, vertex: Vertex, start: int, end: int) -> di
         job = (release - first + min(_EARLY_NS, period // 4)) // period
         completed.setdefault(first + job * period, completion)
     first_job = max(0, (start - deadline - first) // period + 1)
-    return judge_sink(
-        deadline, range(first + first_job * period, end - deadline + 1, period), completed)
+    due = range(first + first_job * period, end - deadline + 1, period)
+    return judge_sink(deadline, due[:first_job == 0] if dag.once else due, completed)
 
 
 def judge_sink(

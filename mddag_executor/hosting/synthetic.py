@@ -406,6 +406,8 @@ class SyntheticWorkload:
         dag, ledger, current_job = self._dag(role.vertex), self.ledger, self._current_job
 
         def on_timer() -> None:
+            if callback.once:
+                timer.cancel()
             start = ledger.now()
             job = current_job()
             release = grid.release() if job is None else job.release_ns

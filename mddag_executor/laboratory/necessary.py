@@ -61,13 +61,15 @@ def necessary_tests(task_set: TaskSet, workers: int, budget: str = 'mean') -> li
     """
     if workers < 1:
         raise UsageError(f'workers: {workers} is too few: give at least 1')
-    tasks = tasks_of(task_set, budget)
+    tasks = [task for task in tasks_of(task_set, budget) if not task.dag.once]
     return [_longest_path(tasks), _utilisation(tasks, workers), _demand(tasks, workers)]
 
 
 def _longest_path(tasks: Sequence[Task]) -> Verdict:
     sinks = [(task.dag.vertices[sink].name, deadline, length)
              for task in tasks for sink, deadline, length in task.sinks]
+    if not sinks:
+        return Verdict('longest path', True, 'no deadline', 'no sink has a deadline', {})
     late = sum(length > deadline for _, deadline, length in sinks)
     worst, deadline, length = max(sinks, key=lambda sink: sink[2] / sink[1])
     return Verdict(

@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mddag_executor import defaults
+from mddag_executor.core.tables import leaf_deadline
 from mddag_executor.errors import UsageError
 from mddag_executor.simulate.workload import check_execution_times
 from msg_graph import Dag, ExecutionTime, TaskSet
@@ -40,7 +41,7 @@ class Task:
     @property
     def utilisation(self) -> float:
         """Return the share of one worker that the task needs."""
-        return self.volume / self.period
+        return 0.0 if self.dag.once else self.volume / self.period
 
 
 def tasks_of(task_set: TaskSet, budget: str = 'max') -> list[Task]:
@@ -69,7 +70,7 @@ def _budget(time: ExecutionTime, budget: str) -> int:
 
 
 def _latest(dag: Dag, costs: list[int]) -> list[int]:
-    latest = [vertex.deadline_ns or 0 for vertex in dag.vertices]
+    latest = [0 if vertex.successors else leaf_deadline(vertex, dag) for vertex in dag.vertices]
     for index in reversed(topological_order(dag)):
         after = dag.vertices[index].successors
         if after:
