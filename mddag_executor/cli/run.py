@@ -54,7 +54,7 @@ mddag run --node my_package/driver --node my_package/filter --trace run.mcap"""
 
 # An end that takes longer than this writes the stack of each thread: well above the duration of an
 # end with slow callbacks, middleware and disk.
-STUCK_S = 30.0
+STUCK_S = 40.0
 # A part ends at last, whatever its nodes do.
 _PART_ENDS_S = 60
 # How long nodes of several processes wait for each other, once the programs have started: if the
@@ -365,7 +365,7 @@ def _run_programs(
         # What a callback raised says more than that its program failed to start.
         if session.error is None:
             raise
-    left = host.end()
+    left = host.end(session.is_patient)
     for guest in host.guests:
         if guest.error is not None and session.error is None:
             session.error = guest.error
@@ -377,12 +377,14 @@ class Signals:
     """
     Let SIGINT, SIGTERM and SIGHUP end the run, and its report be written; a context manager.
 
-    A SIGINT that comes a while after the first interrupts the program itself.
+    A SIGINT that comes while a run ends, but not together with the first, interrupts what still
+    runs; the next one interrupts the end itself.
     """
 
     def __init__(self) -> None:
         self._session: Session | Supervisor | None = None
-        self._first: float | None = None
+        self._last: float | None = None  # when one came that counts
+        self._hurried = False
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Signals:
@@ -399,15 +401,19 @@ class Signals:
     def __exit__(self, *args: object) -> None:
         for number, before in self._before.items():
             signal.signal(number, before)
-        for number in self._before if self._first is not None else ():
+        for number in self._before if self._last is not None else ():
             # The process is about to end by itself; it is not to look as if it was killed.
             signal.signal(number, signal.SIG_IGN)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        now = time.monotonic()
-        if self._first is None:
-            self._first = now
-        elif number == signal.SIGINT and now - self._first > SAME_SIGNAL_S:
-            signal.default_int_handler(number, frame)
-        if self._session is not None:
-            self._session.stop(hurried=True)
+        now, session = time.monotonic(), self._session
+        if session is None or self._last is None and not session.stopped:
+            self._last = now
+        elif number == signal.SIGINT and (
+                self._last is None or now - self._last > SAME_SIGNAL_S):
+            if self._hurried:
+                signal.default_int_handler(number, frame)
+            self._last, self._hurried = now, True
+            session.hurry()
+        if session is not None:
+            session.stop()

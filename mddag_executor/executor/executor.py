@@ -76,7 +76,8 @@ if TYPE_CHECKING:
 
 LONGEST_WAIT_S = 3600.0
 """One wait of the spinning thread: system calls refuse times beyond 24 days."""
-
+_ANSWER_S = 1.0
+"""How long callbacks that wait for a service may still get its response at the end."""
 SETTLE_S = 0.1
 """How long to check whether the callback that completed a future has ended."""
 
@@ -355,6 +356,26 @@ class MultiDeadlineExecutor(BareExecutor):
         """Return a context manager that lends the worker of the calling callback, if it is one."""
         running = current.running
         return nullcontext() if running is None else running.lend()
+
+    def finish_callbacks(self, is_patient: Callable[[], bool]) -> bool:
+        """
+        Start no more callbacks, and wait for the running ones; the executor still spins.
+
+        So responses still arrive, and what sleeps with a Rate goes on.  Callbacks that only wait
+        for a service are not waited for long: it may be one whose callback does not start.
+
+        :param is_patient: whether to wait any longer.
+        :return: whether no callback runs.
+        """
+        self._pool.pause()
+        served = time.monotonic() + _ANSWER_S
+        while self._pool.n_running(time.monotonic() < served):
+            if not is_patient():
+                return False
+            time.sleep(0.005)
+            if self._pool.n_running(False):
+                served = time.monotonic() + _ANSWER_S
+        return True
 
     # --- spinning --------------------------------------------------------------------------------
 

@@ -50,7 +50,8 @@ def _living(kept: _Kept) -> list[tuple[Any, Any]]:
 def is_over(context: Context) -> bool:
     """Return whether a context has ended: was shut down, or destroyed."""
     try:
-        return context in _ended or not context.ok()
+        # not its own `ok`: for what a host of programs runs, it ends with the run
+        return context in _ended or not type(context).ok(context)
     except InvalidHandle:
         return True
 

@@ -924,6 +924,11 @@ class WorkerPool:
         for work in several:
             self.resume(work)
 
+    def n_running(self, with_waiting: bool) -> int:
+        """Return how many callbacks run, with or without those that wait for a service."""
+        return sum(each.work is not None and (with_waiting or not each.waits)
+                   for each in list(self._threads))
+
     def is_idle(self) -> bool:
         """Return whether no execution runs or is ready."""
         return not self.engine.has_waiting and (

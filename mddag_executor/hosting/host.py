@@ -133,7 +133,7 @@ class Host:
         return self
 
     def __exit__(self, *args: object) -> None:
-        self.end(0.0)
+        self.end()
         self._replacements.close()
         for executor in (self.global_executor, *(g.global_executor for g in self.guests)):
             if executor is not None:
@@ -257,13 +257,18 @@ class Host:
         """Shut the context down; all spins return."""
         Context.try_shutdown(self.context)
 
-    def end(self, timeout_s: float = 0.5) -> list[Guest]:
-        """Shut the context down; return the programs that do not end in time."""
+    def end(self, is_patient: Callable[[], bool] = lambda: False) -> list[Guest]:
+        """
+        Shut the context down; return the programs that do not end in time.
+
+        :param is_patient: whether to wait any longer for what they do after their spins.
+        """
         if self.guests:
             self.shut_down()
-        end = time.monotonic() + timeout_s
         for guest in self.guests:
-            guest.thread.join(max(0.0, end - time.monotonic()))
+            while guest.thread.is_alive() and is_patient():
+                guest.thread.join(0.02)
+            guest.thread.join(0.1)
         return [guest for guest in self.guests if guest.thread.is_alive()]
 
     # --- nodes and callbacks ---------------------------------------------------------------------
@@ -333,9 +338,10 @@ class Host:
 
         :param changed: is notified when ``until`` may have become true.
         """
+        is_callback = self.current_guest() is None
         with self._lend(), changed:
             changed.wait_for(
-                lambda: until() or self.is_over(guest),
+                lambda: until() or self.is_over(guest) or is_callback and self._is_ending(),
                 None if timeout_s is None or timeout_s < 0 else timeout_s)
 
     def is_over(self, guest: Guest | None) -> bool:
@@ -379,7 +385,8 @@ class Host:
 
     def _ok(self) -> bool:
         guest = self.current_guest()
-        return Context.ok(self.context) and not (guest is not None and guest.ended)
+        return not self._is_ending() and Context.ok(self.context) and not (
+            guest is not None and guest.ended)
 
     def _shutdown(self, *, context: Context | None = None, **more: Any) -> None:
         guest = self.current_guest()

@@ -54,7 +54,7 @@ from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
 
-END_TIMEOUT_S = 20.0
+END_TIMEOUT_S = 40.0  # longer than a session's
 _POLL_S = 0.02
 _OWN_GROUP: Any = {'process_group': 0} if sys.version_info >= (3, 11) else {}
 _BAD_INPUT = 2
@@ -137,9 +137,20 @@ class Supervisor:
         self._ask_at = math.inf
         self._kill_at: float | None = None
 
-    def stop(self, hurried: bool = False) -> None:
+    @property
+    def stopped(self) -> bool:
+        """Return whether the run is to end."""
+        return self._stop
+
+    def stop(self) -> None:
         """End the run; from any thread, also from a signal handler."""
         self._stop = True
+
+    def hurry(self) -> None:
+        """Let the processes wait no longer for what still runs at the end."""
+        for run in self.runs:
+            if run.status is None and run.asked:
+                run.process.send_signal(signal.SIGINT)
 
     def run(self, names: Sequence[str], seconds: float | None) -> None:
         """

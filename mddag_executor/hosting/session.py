@@ -27,8 +27,8 @@ from mddag_executor.hosting.child import Tick
 from mddag_executor.text import counted
 from rclpy.executors import Executor, ExternalShutdownException
 
-END_TIMEOUT_S = 5.0
-HURRIED_END_TIMEOUT_S = 0.5
+END_TIMEOUT_S = 30.0
+"""How long running callbacks may take to end, and then programs."""
 MATCH_TIMEOUT_S = 30.0
 
 
@@ -57,7 +57,8 @@ class Session:
         self.clean = True
         self.stopped = self._ended = False
         self._on_end = on_end or (lambda: None)
-        self._patience_s = END_TIMEOUT_S
+        self._is_hurried = False
+        self._end_by = math.inf
         self._bell = threading.Lock()
         self._bell.acquire()
         self._spin = spin or executor.spin
@@ -80,13 +81,19 @@ class Session:
         finally:
             self.stop()
 
-    def stop(self, hurried: bool = False) -> None:
-        """End the run, also from a signal handler; ``hurried``: wait less for callbacks."""
-        if hurried:
-            self._patience_s = HURRIED_END_TIMEOUT_S
+    def stop(self) -> None:
+        """End the run, also from a signal handler."""
         self.stopped = True
         with suppress(RuntimeError):  # it is released already
             self._bell.release()
+
+    def hurry(self) -> None:
+        """Wait no longer for what still runs at the end; also from a signal handler."""
+        self._is_hurried = True
+
+    def is_patient(self) -> bool:
+        """Return whether what runs at the end may still take its time."""
+        return not self._is_hurried and time.monotonic() < self._end_by
 
     def wait(self, seconds: float | None, tick: Tick | None = None) -> bool:
         """Wait, for ever with None; return whether the run is to end."""
@@ -129,11 +136,18 @@ class Session:
             return
         self._ended = True
         self._on_end()
-        begin = time.monotonic()
+        self._end_by = time.monotonic() + END_TIMEOUT_S
+        finish = getattr(self.executor, 'finish_callbacks', None)
+        if finish is not None and self._thread.is_alive() and not finish(self.is_patient):
+            self.executor.shutdown(0.0)
+            self.clean = False
+            return
         # In steps: a signal may shorten the wait meanwhile.
         while self.executor.shutdown(0.1) is False:
-            if time.monotonic() - begin > self._patience_s:
+            if not self.is_patient():
                 self.clean = False
                 return
-        self._thread.join(max(0.2, begin + self._patience_s - time.monotonic()))
+        while self._thread.is_alive() and self.is_patient():
+            self._thread.join(0.1)
+        self._thread.join(0.2)
         self.clean = not self._thread.is_alive()

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unmodified programs on our executor, each a real `mddag run --node`; how they are found."""
 
+from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
@@ -10,7 +11,9 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
+from mddag_executor.cli.main import SAME_SIGNAL_S
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
 import pytest
@@ -20,6 +23,7 @@ import rclpy.experimental
 from rclpy.node import Node
 
 from ..cli import golden
+from ..conftest import Done
 from .conftest import GUESTS, wait_for
 
 GRAPH = """\
@@ -152,13 +156,51 @@ def test_exceptions_come_out_behind_the_summary(world, mddag, names, lines):
         assert line in done.stdout + done.stderr
 
 
-def test_what_does_not_end_is_left_behind(world, mddag):
+@contextmanager
+def begun(*arguments):
+    """Begin a command whose output goes to out.txt and err.txt."""
+    with open('out.txt', 'w') as out, open('err.txt', 'w') as err, subprocess.Popen(
+        [sys.executable, '-m', 'mddag_executor', *arguments], stdout=out, stderr=err,
+        env={**os.environ, 'PYTHONUNBUFFERED': '1'},
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_callbacks_that_run_see_the_end_and_finish(world, number):
+    """Also those that sleep with a Rate; they may still publish."""
+    with begun('run', '--node', 'chat:finishes_its_callbacks') as process:
+        assert wait_for(lambda: 'loop begins' in Path('out.txt').read_text(), 60.0)
+        process.send_signal(number)
+        assert process.wait(60) == 0
+    assert 'stops the motors' in Path('out.txt').read_text()
+    assert Path('err.txt').read_text() == ''
+
+
+def test_rclpy_is_no_longer_ok_as_soon_as_a_callback_shuts_it_down(world, mddag):
+    done = mddag('run', '--node', 'chat:shuts_down_in_one_of_two_callbacks')
+    assert done.returncode == 0, done.stderr
+    assert 'closing: ok is False, the loop has ended: True' in done.stdout
+
+
+def test_what_does_not_end_is_left_behind(world):
     """ROS arguments reach all nodes, and what they print stays out of the JSON."""
     (world / 'graph.yaml').write_text(GRAPH.replace('/chatter', '/talk'))
     specs = ('chat_nodes/talker', 'chat:Listener', 'chat:leaves_a_thread', 'chat:never_ends',
              'chat:blocks_in_a_callback')
-    done = mddag('run', 'graph.yaml', *(word for spec in specs for word in ('--node', spec)),
-                 '--duration', '1s', '--json', '-', '--ros-args', '-r', 'chatter:=talk')
+    with begun('run', 'graph.yaml', *(word for spec in specs for word in ('--node', spec)),
+               '--json', '-', '--ros-args', '-r', 'chatter:=talk') as process:
+        assert wait_for(lambda: 'blocked' in Path('err.txt').read_text(), 60.0)
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        time.sleep(2 * SAME_SIGNAL_S)       # another one is no second one before
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    done = Done(process.returncode, Path('out.txt').read_text(), Path('err.txt').read_text())
     assert heard(done.result) >= 3 and done.result['nodes'] == [*specs]
     for line in (
         'not JSON', 'warning: a callback has not ended in time; it is left behind',
@@ -281,7 +323,7 @@ def test_a_program_whose_start_the_end_of_the_run_cuts_off_has_not_failed(
     monkeypatch.setattr('mddag_executor.hosting.host.START_TIMEOUT_S', 0.1)
     with Host() as host:
         host.start(SingleThreadedExecutor(), host.load([spec]))
-        assert host.end(30.0) == [] and type(host.guests[0].error) is error
+        assert host.end(lambda: True) == [] and type(host.guests[0].error) is error
     host.executor.shutdown()
 
 

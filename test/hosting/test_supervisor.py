@@ -160,7 +160,7 @@ def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait():
             if event == 'opcode':
                 left -= 1
                 if left == 0:
-                    session.stop(hurried=True)
+                    session.stop()
             return trace
 
         sys.settrace(trace)

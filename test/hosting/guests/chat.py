@@ -9,7 +9,7 @@ import time
 
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -216,6 +216,51 @@ def after_a_while(callback, seconds=0.2):
     rclpy.spin(node)
 
 
+def finishes_its_callbacks():
+    rclpy.init()
+    node = Node('finishing')
+    group = ReentrantCallbackGroup()
+    rate = node.create_rate(20.0)
+
+    def loop():
+        timer.cancel()
+        print('loop begins')
+        while rclpy.ok():
+            rate.sleep()
+        time.sleep(1.0)  # brakes
+        node.create_publisher(String, 'stopped', 10).publish(String(data='all'))
+        print('stops the motors')
+
+    timer = node.create_timer(0.01, loop, callback_group=group)
+    executor = MultiThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+def shuts_down_in_one_of_two_callbacks():
+    rclpy.init()
+    node = Node('closing')
+    group = ReentrantCallbackGroup()
+    ended = threading.Event()
+
+    def loop():
+        timer.cancel()
+        while rclpy.ok():
+            time.sleep(0.01)
+        ended.set()
+
+    def stop():
+        stopper.cancel()
+        rclpy.shutdown()
+        print(f'closing: ok is {rclpy.ok()}, the loop has ended: {ended.wait(20.0)}')
+
+    timer = node.create_timer(0.01, loop, callback_group=group)
+    stopper = node.create_timer(0.3, stop, callback_group=group)
+    executor = MultiThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
 def shuts_down_in_a_callback():
     after_a_while(lambda: rclpy.shutdown(), 1.5)
     print('shut down')
@@ -256,7 +301,11 @@ def never_ends():
 
 
 def blocks_in_a_callback():
-    after_a_while(lambda: time.sleep(60))
+    def block():
+        print('blocked')
+        time.sleep(60)
+
+    after_a_while(block)
 
 
 def raises_in_a_callback():
