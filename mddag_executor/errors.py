@@ -12,6 +12,11 @@ do`. The command line prints it after `error: ` and exits with status 2; a Pytho
 
 from __future__ import annotations
 
+import os
+from types import TracebackType
+
+_OWN_FOLDER = os.path.dirname(os.path.abspath(__file__)) + os.sep
+
 
 class MddagError(Exception):
     """
@@ -56,3 +61,18 @@ class UserCodeError(MddagError):
 
 class UsageError(MddagError):
     """Settings, or a command line, that ask for something impossible."""
+
+
+def from_user_code(error: BaseException) -> BaseException:
+    """
+    Let an exception's traceback begin in the user's code, and return it.
+
+    The frames of this package before that say nothing about the error.  With `MDDAG_DEBUG=1`, and
+    if there are no others, they stay.
+    """
+    first: TracebackType | None = error.__traceback__
+    while first is not None and first.tb_frame.f_code.co_filename.startswith(_OWN_FOLDER):
+        first = first.tb_next
+    if first is not None and os.environ.get('MDDAG_DEBUG') != '1':
+        error.__traceback__ = first
+    return error

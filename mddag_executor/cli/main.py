@@ -30,7 +30,7 @@ from typing import Any
 from mddag_executor import __version__
 from mddag_executor.cli.parsing import Parser, unknown, verb_parser
 from mddag_executor.cli.text import label, one_line, set_quiet
-from mddag_executor.errors import MddagError, UsageError, UserCodeError
+from mddag_executor.errors import from_user_code, MddagError, UsageError, UserCodeError
 
 EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
@@ -207,7 +207,7 @@ def _status_of(run: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
         raised = error.__cause__ if isinstance(error, UserCodeError) else error
         if line is None or raised is not error or os.environ.get('MDDAG_DEBUG') == '1':
             import traceback
-            traceback.print_exception(raised)
+            traceback.print_exception(raised and from_user_code(raised))
         if line is None:
             return EXIT_DEFECT
         for each in _user_lines(error, line):

@@ -124,8 +124,19 @@ def main(args: argparse.Namespace) -> int:
         task_set = replace(task_set, processes=())
     result, error = run_here(args, task_set)
     common.show(args, result, live_lines(result))
-    return _end(error or incomplete(result['trace']), verdicts.exit_status(
-        args, result['dags'], result['file'] or 'mddag run'))
+    status = verdicts.exit_status(args, result['dags'], result['file'] or 'mddag run')
+    return _end(error or incomplete(result['trace']) or not_found(args, result), status)
+
+
+def not_found(args: argparse.Namespace, result: dict[str, Any]) -> MddagError | None:
+    """Return the error that nothing declared was there; `--fail-on-miss` has one of its own."""
+    if args.fail_on_miss or not result['dags'] or any(
+            each['declared'] for each in result['callbacks'].values()):
+        return None
+    return UsageError(
+        f'{result["file"] or "GRAPH"}: none of its callbacks was in the nodes that ran, so '
+        'nothing was judged: check that it is the declaration of these nodes, with their names '
+        'and namespaces')
 
 
 def incomplete(*traces: dict[str, Any] | None) -> MddagError | None:

@@ -22,7 +22,7 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.cli import common, verdicts
 from mddag_executor.cli.main import EXIT_DEFECT
-from mddag_executor.cli.run import incomplete, Signals, warn_of
+from mddag_executor.cli.run import incomplete, not_found, Signals, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 from mddag_executor.output_rules import remove_recording
@@ -117,7 +117,8 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     if any(run.died for run in supervisor.runs):
         return EXIT_DEFECT
     status = verdicts.exit_status(args, result['dags'], task_set.file)
-    if error := incomplete(*(part['trace'] for part in parts if part is not None)):
+    if error := incomplete(*(part['trace'] for part in parts if part is not None)) or not_found(
+            args, result):
         raise error
     return status
 

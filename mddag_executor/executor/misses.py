@@ -27,6 +27,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
+from mddag_executor.errors import from_user_code
 from mddag_executor.executor.bounds import END_S, LOG_EVERY_S
 from mddag_executor.executor.shutdown import join, stop_at_exit
 from mddag_executor.text import counted
@@ -110,7 +111,7 @@ class MissNotifier:
             try:
                 self._handler(miss)
             except BaseException as error:
-                self._fail(error)
+                self._fail(from_user_code(error))
             if time.monotonic() >= self._warn_at:
                 self._warn()
         self._warn()

@@ -50,6 +50,7 @@ import weakref
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core.queues import TURN_NS
 from mddag_executor.core.tables import NEVER
+from mddag_executor.errors import from_user_code
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     END_S,
@@ -707,7 +708,7 @@ class WorkerPool:
             me.outcome = error
             return
         except BaseException as error:
-            me.outcome = error
+            me.outcome = from_user_code(error)
         if group is not None and (
                 me.outcome is None or isinstance(me.outcome, BaseException)):
             group.ending_execution(entity.rclpy)

@@ -9,7 +9,9 @@ Theory of operation
 2. While a ``Host`` is entered, these functions are replaced:
 
    =================================  ============================================================
-   ``init`` of the default context    does nothing: the context is initialised already
+   ``init`` of the default context    does nothing: the context is initialised already; after the
+                                      program's ``shutdown`` its nodes run again
+   ``init`` of another context        warns that what runs in it is not judged
    its ``shutdown``                   called by a program's thread, ends that program; called by
                                       any other thread (in a callback), ends the run
    its ``ok``                         is also False in the threads of a program that has ended
@@ -24,7 +26,7 @@ Theory of operation
 
 3. A program that spins passes its nodes to the host's executor and waits until the run or the
    program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are then
-   removed, unless it has returned them.  The run ends with the last program.
+   removed, unless it has returned them.  The run ends when the last main has returned.
 4. An exception of a callback is raised by the spin of its program.  Nodes that a program has
    returned have no such spin: their exceptions end the run.
 
@@ -35,6 +37,7 @@ until the next program starts.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
@@ -48,6 +51,7 @@ import weakref
 
 from mddag_executor.executor.compat import alive, executor_kept
 from mddag_executor.executor.registry import snapshot
+from mddag_executor.executor.work import current
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.guest_signals import GuestSignals
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
@@ -69,7 +73,8 @@ class Guest:
 
     :ivar nodes: its nodes on the executor.
     :ivar is_complete: whether ``nodes`` holds all initial nodes, or the program has ended.
-    :ivar ended: whether its nodes run no more callbacks.
+    :ivar ended: whether its nodes run no more callbacks; it may initialise rclpy again.
+    :ivar finished: whether its main has ended.
     :ivar returned: whether its main has returned nodes.
     :ivar uses_ros: whether it has initialised rclpy.
     :ivar error: the exception that has ended its main.
@@ -80,6 +85,7 @@ class Guest:
     nodes: list[Node] = field(default_factory=list)
     is_complete: bool = False
     ended: bool = False
+    finished: bool = False
     returned: bool = False
     uses_ros: bool = False
     error: BaseException | None = None
@@ -105,6 +111,7 @@ class Host:
         self._lock = threading.RLock()  # reentrant: a signal handler may interrupt its owner
         self._node_of: Any = weakref.WeakKeyDictionary()  # by entity
         self._executors: Any = weakref.WeakSet()
+        self._of_callbacks: Any = weakref.WeakSet()  # threads
         # the node behind each object that a program has added as a node
         self._behind: Any = weakref.WeakKeyDictionary()
         self._signals = GuestSignals(self)
@@ -125,6 +132,7 @@ class Host:
         replace(rclpy, 'install_signal_handlers', instead(lambda *args: None))
         replace(rclpy, 'get_global_executor', instead(self._global_executor))
         replace(Executor, '__init__', self._executor_init)
+        replace(Context, 'init', self._init_other)
         replace(threading.Thread, 'start', self._thread_start)
         for package in ('rclpy.experimental', 'rclpy.experimental.events_executor'):
             with suppress(ImportError, KeyError):  # some versions do not have it
@@ -195,7 +203,8 @@ class Host:
         spec = guest.program.spec
         if isinstance(guest.error, LoadingError):
             raise guest.error
-        if guest.error is not None:
+        if guest.error is not None and not (
+                isinstance(guest.error, SystemExit) and guest.uses_ros):  # its exit status
             failure = LoadingError if isinstance(guest.error, SystemExit) else ProgramFailed
             raise failure(
                 spec, f'it failed while starting ({describe(guest.error)})',
@@ -207,8 +216,17 @@ class Host:
 
     def _run(self, guest: Guest) -> None:
         """Run a program in its thread."""
+        loop = asyncio.new_event_loop()  # as the main thread of a program has one
+        asyncio.set_event_loop(loop)
         try:
-            nodes = _nodes_in(guest.program, guest.program.run())
+            value = guest.program.run()
+            nodes = _nodes_in(value)
+            if nodes is None:
+                if not guest.uses_ros and not isinstance(value, int):
+                    raise LoadingError(
+                        guest.program.spec, f'it returned a {type(value).__name__}, which is no '
+                        'rclpy node', 'let it return a node, a list of nodes, or nothing')
+                raise SystemExit(value)  # as a console script passes it to sys.exit
             guest.returned = bool(nodes)
             for node in nodes:
                 if node.executor is None:
@@ -224,8 +242,10 @@ class Host:
             if guest.is_complete or not self._ended or not (
                     type(error).__module__.startswith('rclpy.')):
                 guest.error = error
+        guest.finished = True
         if guest.error is not None or not guest.returned:
             self.program_ended(guest)
+        loop.close()
         guest.is_complete = True
 
     def program_ended(self, guest: Guest) -> None:
@@ -250,7 +270,7 @@ class Host:
                 'run no more')
 
     def _end_run_after_last(self) -> None:
-        if self._all_started and all(guest.ended for guest in self.guests):
+        if self._all_started and all(g.ended and g.finished for g in self.guests):
             self.end_run()
 
     def shut_down(self) -> None:
@@ -369,6 +389,8 @@ class Host:
     def _thread_start(self, original: Callable[..., None]) -> Callable[..., None]:
         def start(thread: threading.Thread) -> None:
             self.guest_of.setdefault(thread, self.current_guest())
+            if self._is_of_callback():
+                self._of_callbacks.add(thread)
             original(thread)
 
         return start
@@ -377,16 +399,35 @@ class Host:
         guest = self.current_guest()
         if guest is not None:
             guest.uses_ros = True
+            if not guest.finished and not self._is_ending():
+                guest.ended = False  # as each rclpy.init after a shutdown makes a new context
         if domain_id is not None and domain_id != self.context.get_domain_id():
             raise LoadingError(
                 guest.program.spec if guest else 'rclpy.init',
                 f'it asks for ROS domain {domain_id}, and this process is in another',
                 f'set ROS_DOMAIN_ID={domain_id}, or run it by itself')
 
+    def _init_other(self, original: Callable[..., None]) -> Callable[..., None]:
+        def init(context: Context, *args: Any, **more: Any) -> None:
+            original(context, *args, **more)
+            guest = self.current_guest()
+            if guest is not None:
+                guest.uses_ros = True
+                get_logger('mddag_executor').warning(
+                    f'--node {guest.program.spec}: it has a context of its own: what runs in that '
+                    'is neither ordered nor judged here')
+
+        return init
+
     def _ok(self) -> bool:
         guest = self.current_guest()
-        return not self._is_ending() and Context.ok(self.context) and not (
-            guest is not None and guest.ended)
+        if self._is_ending() and (guest is not None or self._is_of_callback()):
+            return False  # but for the executor's own threads it is until the very end
+        return Context.ok(self.context) and not (guest is not None and guest.ended)
+
+    def _is_of_callback(self) -> bool:
+        """Return whether the calling thread runs a callback, or was started by one."""
+        return current.running is not None or threading.current_thread() in self._of_callbacks
 
     def _shutdown(self, *, context: Context | None = None, **more: Any) -> None:
         guest = self.current_guest()
@@ -443,13 +484,9 @@ def _return_to(folder: str) -> None:
         os.chdir(folder)
 
 
-def _nodes_in(program: Program, value: Any) -> list[Node]:
-    """Return the nodes that a program returned; a main() returns None or its exit status."""
+def _nodes_in(value: Any) -> list[Node] | None:
+    """Return the nodes that a program has returned; None: another value, its exit status."""
     nodes = list(value) if isinstance(value, (list, tuple, set)) else [value]
     if all(isinstance(node, Node) for node in nodes):
         return nodes
-    if value is None or isinstance(value, int):
-        return []
-    raise LoadingError(
-        program.spec, f'it returned a {type(value).__name__}, which is no rclpy node',
-        'let it return a node, a list of nodes, or nothing')
+    return [] if value is None else None

@@ -200,6 +200,8 @@ def describe(error: BaseException) -> str:
     # str(error) may raise, too
     text = ' '.join(str(traceback.TracebackException.from_exception(error)).split())
     name = type(error).__name__
+    if isinstance(error, SyntaxError) and error.filename is not None:
+        return f'{name}: {error.msg}, {error.filename}:{error.lineno}'
     frames = traceback.extract_tb(error.__traceback__)
     own = [f for f in frames if not f.filename.startswith('<') and f.filename != __file__]
     place = f', {own[-1].filename}:{own[-1].lineno}' if own else ''

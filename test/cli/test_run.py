@@ -301,6 +301,35 @@ def test_what_a_node_raises_has_its_traceback_and_is_no_bad_input(
     assert lines[-1].startswith(f'error: {place} ') and 'FileNotFoundError' in lines[-1]
 
 
+def test_a_traceback_begins_in_the_users_code(folder, mddag):
+    """And an error of its syntax is located there."""
+    Path('bad.py').write_text(BAD_NODES)
+    done = mddag('run', '--node', 'bad:Calibrated')
+    traceback = done.stderr[done.stderr.index('Traceback'):].splitlines()
+    assert re.match(r'  File ".*bad\.py", line \d+, in tick$', traceback[1]), done.stderr
+    Path('half.py').write_text('x = 1\ndef main(:\n')
+    done = mddag('run', '--node', 'half:main')
+    assert f"(SyntaxError: invalid syntax, {folder / 'half.py'}:2)" in done.stderr
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1)
+
+
+def test_the_declaration_of_another_robot_is_an_error(folder, mddag):
+    """But a run too short for a job to be due is none."""
+    Path('n.yaml').write_text(ONE_TIMER.replace('/n,', '/robot2/n,'))
+    Path('good.py').write_text(
+        'from rclpy.node import Node\n\n\nclass Good(Node):\n\n    def __init__(self):\n'
+        "        super().__init__('n')\n        self.create_timer(0.02, lambda: None)\n")
+    for more in ((), ('--processes', 'two.yaml')):
+        Path('two.yaml').write_text('processes: {one: [/robot2/n]}\n')
+        done = mddag('run', 'n.yaml', '--node', 'good:Good', '--duration', '300ms', *more)
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.splitlines()[-1].startswith(
+            'error: n.yaml: none of its callbacks was in the nodes that ran, so nothing ')
+    Path('n.yaml').write_text(ONE_TIMER.replace('20ms', '20s').replace('10ms', '10s'))
+    Path('good.py').write_text(Path('good.py').read_text().replace('0.02', '20.0'))
+    assert mddag('run', 'n.yaml', '--node', 'good:Good', '--duration', '10ms').returncode == 0
+
+
 @pytest.mark.parametrize('spec', ['bad:Talker', 'bad:odd'])
 def test_nodes_that_change_the_folder_and_raise_what_has_no_text(folder, mddag, spec):
     Path('n.yaml').write_text(ONE_TIMER)

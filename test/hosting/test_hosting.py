@@ -126,7 +126,7 @@ def test_unmodified_programs_run_on_our_executor(world):
 
 
 def test_a_run_ends_with_its_last_program(world, mddag):
-    done = mddag('run', 'graph.yaml', '--node', 'chat:never_spins')
+    done = mddag('run', '--node', 'chat:never_spins')
     assert done.returncode == 0, done.stderr
     assert 'typed w' in done.stdout.splitlines()
 
@@ -138,6 +138,15 @@ def test_what_a_node_raises_while_it_is_removed_ends_the_run(world, mddag):
     done = mddag('run', '--node', 'chat:passes_on')
     assert (done.returncode, done.stderr) == (0, '')
     assert 'passed on' in done.stdout and '/behind: ' in done.stdout
+
+
+@pytest.mark.parametrize(('name', 'status', 'says'), [
+    ('returns_status', 4, ''), ('returns_reason', 1, 'not calibrated'), ('has_a_loop', 0, ''),
+    ('has_another_context', 0, 'chat:has_another_context: it has a context of its own')])
+def test_a_program_ends_as_without_the_host(world, mddag, name, status, says):
+    done = mddag('run', '--node', f'chat:{name}')
+    assert done.returncode == status and 'Traceback' not in done.stderr, done.stderr
+    assert says in done.stderr and 'no declaration was given' in done.stdout
 
 
 @pytest.mark.parametrize(('names', 'lines'), [
@@ -329,7 +338,7 @@ def test_a_program_whose_start_the_end_of_the_run_cuts_off_has_not_failed(
 
 def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag):
     done = mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'out.mcap')
-    assert (done.returncode, done.stderr.count('\n')) == (2, 1)
+    assert (done.returncode, done.stderr.count('\n')) == (2, 1), done.stderr
     assert not Path('out.mcap').exists()
     Path('null').symlink_to('/dev/null')    # a device stays, also if root names it
     assert mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'null').returncode == 2

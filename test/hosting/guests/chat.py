@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Unmodified programs of many kinds; none knows of this executor."""
 
+import asyncio
 import os
 import signal
 import threading
@@ -9,7 +10,11 @@ import time
 
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import (
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -203,6 +208,46 @@ def passes_on():
     proxy.node.destroy_node()
     rclpy.try_shutdown()
     print('passed on')
+
+
+def returns_status():
+    rclpy.init()
+    rclpy.spin_once(Node('returning'), timeout_sec=0.1)
+    rclpy.shutdown()
+    return 4
+
+
+def returns_reason():
+    returns_status()
+    return 'not calibrated'
+
+
+def begins_again():
+    for _ in range(2):
+        rclpy.init()
+        node = Node('again')
+        node.create_timer(0.05, rclpy.shutdown)
+        try:
+            rclpy.spin(node)
+        except ExternalShutdownException:
+            pass
+        print(f'again: ok is {rclpy.ok()}')
+        rclpy.try_shutdown()
+
+
+def has_another_context():
+    context = rclpy.context.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(Node('elsewhere', context=context))
+    executor.spin_once(timeout_sec=0.1)
+    executor.shutdown()
+    rclpy.shutdown(context=context)
+
+
+def has_a_loop():
+    asyncio.get_event_loop().run_until_complete(asyncio.sleep(0.01))
+    never_spins()
 
 
 # --- how a run ends ------------------------------------------------------------------------------
