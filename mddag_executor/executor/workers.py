@@ -620,7 +620,9 @@ class WorkerPool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         engine = self.engine
         due = self.due
-        work: Any = engine.dispatch(me.worker, now) if self.running else None
+        # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
+        may_run = self.running and not (self._is_stepping and me.thread is not None)
+        work: Any = engine.dispatch(me.worker, now) if may_run else None
         while work in self._rejoining:
             self._hand_over(work, now)
             work = engine.dispatch(me.worker, now)
@@ -631,6 +633,8 @@ class WorkerPool:
             self.log_misses()
             if me.thread is not None:  # else a visitor: the thread of a spin_once
                 self._rest(me, has_events)
+                if self._is_stepping and engine.may_start_more(now):
+                    self._wake_one()
             return False
         me.work = work
         me.worker = work.worker
@@ -665,7 +669,7 @@ class WorkerPool:
         leader = self._leader
         is_left_to_leader = (
             has_events and leader is not me and leader is not None and leader.is_short())
-        if self.running and not is_left_to_leader and (
+        if self.running and not self._is_stepping and not is_left_to_leader and (
                 len(self._threads) - self._waiting_calls - len(self._parked)
                 <= self.engine.n_workers):
             me.waits_since = self.now

@@ -87,6 +87,39 @@ def test_a_timeout_may_be_as_long_as_you_like(make_executor, seconds):
     assert executor.shutdown(seconds)
 
 
+def test_a_callback_that_outlasts_a_spin_leaves_the_next_ones_to_spin_once(make_executor):
+    """Its worker ran them, so that spin_once waited for something that had happened already."""
+    executor = make_executor(num_workers=2)
+    begun, may_end, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def outlast():
+        begun.set()
+        may_end.wait(10)
+        ended.set()
+
+    def go_on():
+        time.sleep(0.02)
+        may_end.set()
+        ended.wait(10)
+        time.sleep(0.02)  # its worker has nothing more to do
+        executor.create_task(run)
+
+    def run():
+        ran.append(threading.get_ident())
+        if len(ran) < 20:
+            executor.create_task(run)
+
+    executor.create_task(outlast)
+    future, ran = Future(executor=executor), []
+    threading.Thread(target=lambda: begun.wait(10) and future.set_result(1)).start()
+    executor.spin_until_future_complete(future)
+    threading.Thread(target=go_on).start()
+    for number in range(20):
+        executor.spin_once(10.0)
+        assert len(ran) == number + 1
+    assert {*ran} == {threading.get_ident()}
+
+
 def test_spinning_twice_is_an_error(make_executor):
     executor = make_executor()
     assert not executor.is_spinning
