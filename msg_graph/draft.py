@@ -116,6 +116,7 @@ class Draft:
     A system.
 
     :ivar origin: the source of the draft, for the first line of the declaration.
+    :ivar processes: the nodes of each process; empty: one process.
     :ivar left_out: callbacks missing from the declaration, with the reason.
     """
 
@@ -123,6 +124,7 @@ class Draft:
     nodes: list[DraftNode]
     paths: list[DraftPath] = field(default_factory=list)
     workers: int | None = None
+    processes: dict[str, list[str]] = field(default_factory=dict)
     left_out: list[str] = field(default_factory=list)
 
     def callbacks(self) -> Iterator[DraftCallback]:
@@ -222,6 +224,10 @@ class _Writer:
         yield 'mddag: 1'
         if self._draft.workers is not None:
             yield f'workers: {self._draft.workers}'
+        if self._draft.processes:
+            yield 'processes:'
+            yield from (f'  {plain_scalar(name)}: {_listed(nodes)}'
+                        for name, nodes in self._draft.processes.items())
         yield 'nodes:'
         for node in self._draft.nodes:
             yield f'  - node: {plain_scalar(node.name)}'

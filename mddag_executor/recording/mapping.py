@@ -216,7 +216,7 @@ class Matching:
     """
 
     def __init__(
-        self, name: str, who: Entities, threads: Set[tuple[int, int]], judge: TaskSet | None
+        self, name: str, who: Entities, judge: TaskSet | None
     ) -> None:
         self.task_set = judge or NO_GRAPH
         self.warnings: list[str] = []
@@ -230,8 +230,3 @@ class Matching:
         self.warnings += report_missing(
             name, judge, found, [c.label for c in who.every if c.kind != 'service'],
             [c.entity for c in who.every if c.entity is not None and c.number not in self.target])
-        processes = len({pid for pid, _ in threads})
-        if processes > 1:
-            self.warnings.append(
-                f'{name}: {processes} processes ran callbacks, each with workers of its own: '
-                f'{counted(len(threads), "thread")} are taken together')

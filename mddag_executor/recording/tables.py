@@ -24,7 +24,7 @@ Theory of operation
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TYPE_CHECKING
 
@@ -168,6 +168,7 @@ class Recording:
     :ivar notices_stops: from this time on stops are recorded, ns; None: they are not.
     :ivar processes: number of processes, each with ``workers_each`` workers.
     :ivar placed: nodes of each process; empty: one process.
+    :ivar process_names: in a recording of another executor by process id a name.
     :ivar worker_names: names of workers, if they are more than a number.
     :ivar links: whether ``message`` is the publication that started an execution; otherwise the
         job links them.
@@ -211,6 +212,7 @@ class Recording:
     processes: int = 1
     workers_each: int = 0
     placed: Sequence[Process] = ()
+    process_names: Mapping[int, str] = field(default_factory=dict)
     worker_names: Sequence[str] = ()
     links: bool = False
     callback_vertex: dict[int, int] = field(default_factory=dict)

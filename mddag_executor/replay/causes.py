@@ -21,6 +21,9 @@ along its critical chain (see ``chains``):
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
 * end of a callback until the next one is ready: *transport*;
+* ready callback in a recording of another executor, which does not say when a message or timer was
+  noticed: *waited* while its own thread ran a callback; with an idle thread *released late* (a
+  source), else *transport*, because the message was still on its way;
 * job that ended early because of a callback that never ran, or a sync that did not get all of its
   messages: *dropped* if the executor dropped the message from its queue, *destroyed* if it did so
   because the node or subscription was destroyed; *waited* if the callback was ready; *not
@@ -93,12 +96,15 @@ Columns of a miss: ``at`` is the vertex that the job reached, ``length`` the len
 """
 PARTS_OF = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('cause', 'i8'), ('begin', 'i8'), ('end', 'i8'),
-    ('ns', 'i8')])
-"""Columns of a part of the time of a miss; ``cause`` is an index of ``PARTS``."""
+    ('ns', 'i8'), ('place', 'i8')])
+"""
+Columns of a part of the time of a miss; ``cause`` is an index of ``PARTS``, ``place`` where the
+callback ran (see ``Pool``).
+"""
 # A time span of a miss at a vertex: of a wait its group part, of an execution its CPU time.
 _SPAN = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('kind', 'i8'), ('begin', 'i8'), ('end', 'i8'),
-    ('more', 'i8')])
+    ('more', 'i8'), ('place', 'i8')])
 _LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _PENDING = range(6)
 
 
@@ -111,6 +117,10 @@ class Pool(NamedTuple):
     :ivar stalls: begin and end of each stall.
     :ivar knows_workers: whether the number of workers is known, and an idle one starts what is
         ready.
+    :ivar place_of: by execution its place, whose callbacks may delay each other: its thread in a
+        recording of another executor, else its process; ``place_of_vertex``: the same of the last
+        execution of each vertex, -1: none.
+    :ivar threads: by thread when callbacks ran in it; None: places are processes.
     """
 
     full: Spans
@@ -118,6 +128,9 @@ class Pool(NamedTuple):
     shared: Spans
     stalls: list[tuple[int, int]]
     knows_workers: bool
+    place_of: Ints
+    place_of_vertex: Ints
+    threads: dict[int, Spans] | None
 
 
 class Usual(NamedTuple):
@@ -211,7 +224,7 @@ def find(
     :param dag_of: by global vertex its DAG; ``deadline``: its relative deadline as a sink.
     :param is_source: by global vertex whether it is its DAG's source.
     """
-    spans = _spans(rows, chain, is_source)
+    spans = _spans(rows, chain, is_source, pool)
     kinds, of = spans['kind'], spans['miss']
     begins, ends = np.array(pool.stalls, dtype=np.int64).reshape(-1, 2).T
     stalls = Spans(begins, ends)
@@ -234,7 +247,7 @@ def find(
     _pending(rows, spans, times, left, never, pool, is_source)
     waits = kinds == _WAIT
     if waits.any():
-        times[waits] += _waits(spans[waits], left[waits], pool)
+        times[waits] += _waits(spans[waits], left[waits], pool, is_source)
         demoted = np.maximum(0, spans['end'] - np.maximum(spans['begin'], rows['demoted'][of]))
         for part in (WAITED, INTERPRETER):
             moved = np.where(waits, np.minimum(times[:, part], demoted), 0)
@@ -255,13 +268,13 @@ def find(
     causes = _causes(rows, total, amounts, pool, never, is_source)
     which, cause = np.nonzero(times)
     parts = np.zeros(len(which), dtype=PARTS_OF)
-    for name in ('miss', 'vertex', 'begin', 'end'):
+    for name in ('miss', 'vertex', 'begin', 'end', 'place'):
         parts[name] = spans[name][which]
     parts['cause'], parts['ns'] = cause, times[which, cause]
     return Found(rows, causes, parts, short)
 
 
-def _spans(rows: Table, chain: Table, is_source: Any) -> Table:
+def _spans(rows: Table, chain: Table, is_source: Any, pool: Pool) -> Table:
     """Return the time spans of misses, each miss in order."""
     n, lengths = len(rows), rows['length']
     first = np.cumsum(lengths) - lengths
@@ -287,14 +300,15 @@ def _spans(rows: Table, chain: Table, is_source: Any) -> Table:
             table[name] = values
         return table
 
+    own = pool.place_of[chain['row']]
     spans = np.concatenate([
         columns(everyone[some], at[begins], np.where(whole, _LAG, _BEFORE),
-                rows['release'][some], ready[begins], 0),
+                rows['release'][some], ready[begins], 0, own[begins]),
         columns(everyone[~some], rows['at'][~some], _PENDING, rows['release'][~some],
-                rows['until'][~some], 0),
-        columns(of, at, _WAIT, ready, start, chain['group']),
-        columns(of, at, _RUN, start, done, chain['cpu']),
-        columns(of, after_vertex, onward, done, after, 0)])
+                rows['until'][~some], 0, pool.place_of_vertex[rows['at'][~some]]),
+        columns(of, at, _WAIT, ready, start, chain['group'], own),
+        columns(of, at, _RUN, start, done, chain['cpu'], own),
+        columns(of, after_vertex, onward, done, after, 0, pool.place_of_vertex[after_vertex])])
     spans = spans[spans['end'] > spans['begin']]
     return spans[np.lexsort((spans['begin'], spans['miss']))]
 
@@ -313,11 +327,21 @@ def _ran_long(spans: Table, more: Ints, usual: Usual, pool: Pool) -> Ints:
     return times
 
 
-def _waits(spans: Table, left: Ints, pool: Pool) -> Ints:
+def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     """Split the waiting time, without stalls."""
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
     times[:, GROUP] = np.minimum(spans['more'], left)
     left = left - times[:, GROUP]
+    if pool.threads is not None:
+        for thread in np.unique(spans['place']).tolist():
+            mine = np.flatnonzero(spans['place'] == thread)
+            # without an execution its thread is unknown
+            times[mine, WAITED] = left[mine] if thread not in pool.threads else np.minimum(
+                left[mine], pool.threads[thread].within(spans['begin'][mine], spans['end'][mine]))
+        idle, source = left - times[:, WAITED], is_source[spans['vertex']]
+        times[:, RELEASED_LATE] = np.where(source, idle, 0)
+        times[:, TRANSPORT] = np.where(source, 0, idle)
+        return times
     if not pool.knows_workers:
         times[:, WAITED] = left
         return times
@@ -351,7 +375,7 @@ def _pending(
         *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start', 'group')))}
     before = never.waiting(spans['vertex'][pending], spans['end'][pending])
     for i, waiting_job in zip(pending.tolist(), before.tolist()):
-        miss, vertex, _, begin, end, _ = spans[i].item()
+        miss, vertex, _, begin, end, *_ = spans[i].item()
         key = vertex, int(rows['job'][miss])
         ready, start, group = waiting.get(key, (end, end, 0))
         waits = ready < end <= start or never.why_dropped(key) == 'aborted'
@@ -428,33 +452,38 @@ def _given_up(
 
 
 def behind(
-    found: Found, runs: dict[int, Spans], on_workers: dict[int, Spans], group_of: dict[int, int],
-    groups: dict[int, int],
+    found: Found, runs: dict[tuple[int, int], Spans], on_workers: dict[tuple[int, int], Spans],
+    group_of: dict[int, int], groups: dict[int, int],
 ) -> dict[int, list[tuple[int, int]]]:
     """
     Return by part the callbacks that ran while it waited, and how long, longest first.
 
-    :param runs: by callback when it ran; ``on_workers``: when its executions occupied a worker.
+    :param runs: by callback and place (see ``Pool``) when it ran; ``on_workers``: when its
+        executions occupied a worker.  Only those at the place of the part count.
     :param group_of: by vertex its callback group, ``groups``: by callback; -1: a reentrant one.
     """
-    parts, rows = found.parts, found.misses
-    share = 10 * parts['ns'] >= (rows['until'] - rows['release'])[parts['miss']]
-    chosen = np.flatnonzero(np.isin(parts['cause'], _WAITS) & share)
-    if not len(chosen) or not runs:
-        return {}
-    callbacks, parts = list(runs), parts[chosen]
-    begins, ends = parts['begin'], parts['end']
-    times = np.array([each.within(begins, ends) for each in runs.values()])
-    waited = np.isin(parts['cause'], _ON_WORKERS)
-    times[:, waited] = [
-        each.within(begins[waited], ends[waited]) for each in on_workers.values()]
-    grouped = parts['cause'] == GROUP
-    for vertex in np.unique(parts['vertex'][grouped]).tolist():
-        others = [i for i, callback in enumerate(callbacks)
-                  if group_of.get(vertex, -1) != groups.get(callback, -2)]
-        times[np.ix_(others, np.flatnonzero(grouped & (parts['vertex'] == vertex)))] = 0
+    every, rows = found.parts, found.misses
+    share = 10 * every['ns'] >= (rows['until'] - rows['release'])[every['miss']]
+    chosen = np.flatnonzero(np.isin(every['cause'], _WAITS) & share)
     waits: dict[int, list[tuple[int, int]]] = {}
-    for part, column in zip(chosen.tolist(), times.T):
-        order = np.argsort(-column, kind='stable')[:_MOST_BEHIND].tolist()
-        waits[part] = [(callbacks[i], int(column[i])) for i in order if column[i] > 0]
+    for place in np.unique(every['place'][chosen]).tolist():
+        keys = [key for key in runs if key[1] == place]
+        callbacks = [callback for callback, _ in keys]
+        mine = chosen[every['place'][chosen] == place]
+        if not keys:
+            continue
+        parts = every[mine]
+        begins, ends = parts['begin'], parts['end']
+        times = np.array([runs[key].within(begins, ends) for key in keys])
+        waited = np.isin(parts['cause'], _ON_WORKERS)
+        times[:, waited] = [
+            on_workers[key].within(begins[waited], ends[waited]) for key in keys]
+        grouped = parts['cause'] == GROUP
+        for vertex in np.unique(parts['vertex'][grouped]).tolist():
+            others = [i for i, callback in enumerate(callbacks)
+                      if group_of.get(vertex, -1) != groups.get(callback, -2)]
+            times[np.ix_(others, np.flatnonzero(grouped & (parts['vertex'] == vertex)))] = 0
+        for part, column in zip(mine.tolist(), times.T):
+            order = np.argsort(-column, kind='stable')[:_MOST_BEHIND].tolist()
+            waits[part] = [(callbacks[i], int(column[i])) for i in order if column[i] > 0]
     return waits

@@ -53,13 +53,13 @@ import numpy as np
 
 LINKS = np.dtype([
     ('of', 'i8'), ('vertex', 'i8'), ('leg', 'i8'), ('ready', 'i8'), ('start', 'i8'),
-    ('end', 'i8'), ('busy', 'i8'), ('group', 'i8'), ('cpu', 'i8')])
+    ('end', 'i8'), ('busy', 'i8'), ('group', 'i8'), ('cpu', 'i8'), ('row', 'i8')])
 """
 Columns of a link of a chain.
 
 ``of`` is the number of the chain; ``leg`` is the leg that completed the vertex (-1: it never
 completed). Times of the execution: ready, first start, last end, total time of its pieces, waiting
-for the callback group, CPU time (-1: unknown), ns.
+for the callback group, CPU time (-1: unknown), ns; ``row`` of the execution.
 """
 
 
@@ -153,7 +153,7 @@ class Chains:
         known = (table['leg'] >= 0) & (table['leg'] < n_legs)   # otherwise the last one
         found = rows(
             LINKS, len(row), vertex=vertex + self._first[dag], ready=table['ready'],
-            start=table['began'], group=self.waited[row],
+            start=table['began'], group=self.waited[row], row=row,
             leg=np.where(running, -1, np.where(known, table['leg'], n_legs - 1)),
             cpu=np.where(running, -1, table['cpu']))
         for name in ('end', 'busy'):

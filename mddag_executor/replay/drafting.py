@@ -82,6 +82,7 @@ class System:
         self.task_set: TaskSet | None = recording.task_set if declared else None
         self.workers: int | None = recording.head.workers if declared else None
         self.warnings = list(reader.warnings)
+        self._process_names = recording.process_names
         self._who = recording.who
         self._entities = [entity for entity in sorted(
             self._who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
@@ -139,7 +140,18 @@ class System:
         leave_out_sources(draft, lambda callback: (
             callback.runs == 0 and callback.kind != 'timer' and callback.key not in declared),
             'it never ran')
+        draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
         return draft
+
+    def _processes(self, nodes: list[str]) -> dict[str, list[str]]:
+        """Return the given nodes of each process; none if there is one process."""
+        pids = {entity.node.name: entity.node.pid for entity in reversed(self._entities)
+                if entity.node is not None}
+        found: dict[str, list[str]] = {}
+        for node in nodes:
+            if pids.get(node) in self._process_names:
+                found.setdefault(self._process_names[pids[node]], []).append(node)
+        return found if len(found) > 1 else {}
 
     def _ordered(self, nodes: dict[str, DraftNode]) -> list[DraftNode]:
         """

@@ -76,6 +76,10 @@ class Explanation:
         # with several processes it is unknown whose workers were busy
         self._workers = recording.head.workers if recording.declared and \
             recording.processes == 1 and not (policy is not None and policy.polling) else 0
+        # where callbacks may delay each other: of another executor it is not known which threads
+        # share its work
+        self._place = self._executions['worker' if recording.imported else 'process'].astype(
+            np.int64)
         #: Begin and end of each stop of the machine.
         self.stops = self._stops()
         self._to_sinks: dict[int, dict[int, int]] = {}
@@ -134,11 +138,20 @@ class Explanation:
         since, until = table['began'][holding], table['end'][holding]
         first = int(min(table['start'][rows].min(initial=_NO_END),
                         missed['release'].min(initial=_NO_END)))
+        # by vertex the place of its last execution
+        one = not self._recording.imported and self._recording.processes == 1
+        of_vertex = np.full(len(self._task_set.vertices) + 1, 0 if one else -1)
+        of_vertex[table['vertex'][rows]] = self._place[rows]
+        threads = {
+            thread: Spans(*crowded(table['start'][each], table['end'][each], 1))
+            for thread in np.unique(self._place[rows]).tolist()
+            for each in [rows[self._place[rows] == thread]]} if self._recording.imported else None
         return Pool(
             Spans(*crowded(start, end, max(1, self._workers))),
             Spans(*(crowded(since, until, 1) if len(holding) else crowded(start, end, 1))),
             Spans(*crowded(since, until, 2)),
-            [stop for stop in self.stops if stop[1] >= first], self._workers > 0)
+            [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
+            self._place, of_vertex, threads)
 
     def _usual(self) -> Usual:
         """Return the usual times of callbacks and releases."""
@@ -302,10 +315,12 @@ class Explanation:
         callbacks, which = different(table['callback'][rows])
         runs, on_workers = {}, {}
         for callback, at in zip(callbacks.tolist(), rows_by(which, len(callbacks))):
-            mine = rows[at]
-            runs[callback], on_workers[callback] = (
-                Spans(table['start'][each], table['end'][each])
-                for each in (mine, mine[table['worker'][mine] >= 0]))
+            places = self._place[rows[at]]
+            for place in np.unique(places).tolist():
+                mine = rows[at[places == place]]
+                runs[callback, place], on_workers[callback, place] = (
+                    Spans(table['start'][each], table['end'][each])
+                    for each in (mine, mine[table['worker'][mine] >= 0]))
         return behind(self.found, runs, on_workers, self._groups, self._who.groups)
 
     @cached_property

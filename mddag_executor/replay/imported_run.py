@@ -24,7 +24,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable as Function
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+import re
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER
 from mddag_executor.memory import give_back
@@ -55,7 +56,7 @@ from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Event
 from mddag_executor.trace.times import credible
-from msg_graph import TaskSet
+from msg_graph import Process, TaskSet
 import numpy as np
 
 _SLACK_NS = 1_000_000
@@ -94,7 +95,7 @@ class ImportedRun:
         starts = self._starts()
         init = [event for event in self._events.others if event[0].name not in _OWN]
         # this executor recorded it, but its executions are lost
-        own = len(init) < len(self._events.others)
+        own = any(event[0].name in _OWN for event in self._events.others)
         if head is None and (own or not len(starts)):
             raise no_run(reader)
         self._link(init)
@@ -108,7 +109,7 @@ class ImportedRun:
         self.head = head or Head(
             int(starts['time'][0]), '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
         self._imported = head is None
-        self._matching = Matching(name, self.who, threads, task_set)
+        self._matching = Matching(name, self.who, task_set)
         #: The declaration to judge by; none is recorded.
         self.task_set = self._matching.task_set
         self._targets = self._matching.target
@@ -149,6 +150,11 @@ class ImportedRun:
             judged_until=self._judged_until(), lost=links.discarded,
             workers_each=self.head.workers, links=True, callback_vertex=self._vertex,
             worker_names=self._worker_names())
+        if self._imported:
+            found.process_names = dict(zip(
+                self._pids, process_names(self._pids, self._events.names)))
+            found.placed = self._placed(found.process_names)
+            found.workers_each = self._workers_each()
         found.warnings = self._warnings(found)
         return found
 
@@ -174,9 +180,48 @@ class ImportedRun:
             thread=_values([tid for _, tid in events.threads], runs['thread']),
             start=runs['start'], began=runs['start'], end=runs['end'], message=runs['message'],
             busy=np.where(runs['end'] >= 0, runs['end'] - runs['start'], UNKNOWN),
-            cpu=UNKNOWN, order=UNKNOWN, worker=UNKNOWN)
+            cpu=UNKNOWN, order=UNKNOWN, worker=UNKNOWN, process=self._process_of(runs))
         table['worker'][ended] = worker[runs['thread'][ended]]
         return table
+
+    def _process_of(self, runs: Table) -> Ints:
+        """
+        Return the process of each execution, those with declared callbacks first.
+
+        Threads of this executor are workers of one pool.
+        """
+        pids = np.array([pid for pid, _ in self._events.threads], dtype=np.int64)[runs['thread']]
+        declared = [each.number in self._vertex for each in self.links.callbacks]
+        known = np.array(declared, dtype=np.bool_)[runs['callback']]
+        self._pids = list(dict.fromkeys([*np.unique(pids[known]).tolist(),
+                                         *np.unique(pids).tolist()]))
+        self._n_declared = len(np.unique(pids[known]))
+        if not self._imported:
+            return np.zeros(len(runs), dtype=np.int64)
+        order = np.argsort(self._pids)
+        found: Ints = order[np.searchsorted(np.array(self._pids)[order], pids)] if len(
+            runs) else pids
+        return found
+
+    def _placed(self, names: Mapping[int, str]) -> list[Process]:
+        """Return the nodes of each process in which declared callbacks ran, if it has several."""
+        pids = self._pids[:self._n_declared]
+        if len(pids) < 2:
+            return []
+        nodes = dict.fromkeys(callback.node for callback in self.task_set.callbacks)
+        # a node that did not run belongs to the first process, as in declarations
+        pid_of = dict.fromkeys(nodes, pids[0])
+        for each in reversed(self.links.callbacks):
+            if each.node is not None and each.node.name in nodes and each.node.pid in pids:
+                pid_of[each.node.name] = each.node.pid
+        return [Process(names[pid], tuple(node for node in nodes if pid_of[node] == pid))
+                for pid in pids]
+
+    def _workers_each(self) -> int:
+        """Return the largest number of threads of a process in which declared callbacks ran."""
+        pids = self._pids[:self._n_declared]
+        threads = Counter(pid for pid, _ in self._workers)
+        return max((threads[pid] for pid in pids), default=0) or self.head.workers
 
     def _publications(self) -> Table:
         messages, publishers = self.links.messages, self.links.publishers
@@ -331,6 +376,18 @@ class ImportedRun:
         if found.task_set.dags and not len(found.releases):
             lines.append(f'{name}: no job was released in it')
         return lines
+
+
+def process_names(pids: Sequence[int], names: Mapping[tuple[int, int], str]) -> list[str]:
+    """
+    Return a name for each process that a declaration may have, all different.
+
+    :param names: by process and thread its recorded name; that of the process is its first one's.
+    """
+    plain = [re.sub('[^A-Za-z0-9_.-]', '_', names.get((pid, pid), '')) or 'process'
+             for pid in pids]
+    return [name if plain.count(name) == 1 and name != 'process' else f'{name}_{pid}'
+            for name, pid in zip(plain, pids)]
 
 
 def _arrival(runs: Table) -> Ints:

@@ -118,6 +118,8 @@ class LoadBuilder:
         task_set = recording.task_set
         self._task_set, self._recording, self._tables = task_set, recording, tables
         self._first = tables.first_vertex
+        #: Number of runs of undeclared callbacks in other processes than the first.
+        self.left_out = 0
         self._process = [*(processes or [1] * tables.n_vertices), 1]
         self._times = times
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
@@ -198,6 +200,11 @@ class LoadBuilder:
         """Find the dispatch times of pieces; keep undeclared pieces."""
         table = self._executions
         rows = ran(table)
+        if self._recording.imported:    # others have interpreters and threads of their own
+            process = self._recording.executions['process'][rows]
+            other = (table['vertex'][rows] < 0) & (process > 0)
+            self.left_out = int((other & (process < len(self._recording.placed))).sum())
+            rows = rows[~other]
         vertex, piece, ready, start, end, worker, holds, cpu, completes = (
             table[name][rows] for name in (
                 'vertex', 'piece', 'ready', 'start', 'end', 'worker', 'holds_gil', 'cpu',

@@ -178,7 +178,7 @@ def reschedule(
         path, task_set, name, progress)
     if run.task_set is NO_GRAPH:
         raise undeclared(run.name)
-    head, each = run.head, run.workers_each
+    head, each, given = run.head, run.workers_each, policy
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
     cpus = cpus or head.cpus or None
     if preemptive is None:
@@ -201,6 +201,12 @@ def reschedule(
     if DEMOTE in tables.on_late:  # by measured times, as the executor does
         tables = tables_of(with_execution_times(run.task_set, builder.times()))
     tables = tables._replace(process=[*_processes(run, placed), 1])
+    notes = []
+    if given is None and len(placed) > 1 and find_policy(policy).polling:
+        notes.append(
+            f'{run.name}: rescheduled with policy fifo, because {policy} (polling) is known of '
+            'one process only: choose another with --policy')
+        policy = 'fifo'
     find_policy(policy).mode(preemptive, len(placed))
     with no_garbage():
         work = builder.build(overheads, tables.process, workers if workers < each else NEVER)
@@ -211,12 +217,18 @@ def reschedule(
             'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, run.who.groups, declared_first=not run.same)
+    left_out = builder.left_out
     del builder     # the load has copies of its data
     give_back()
     warnings, judge_from = run.warnings, run.begin + skip if skip else -NEVER
     begin, judge_until = run.judged_releases or (-NEVER, NEVER)
     if recorded is not None:
         warnings, judge_from = recorded.warnings, recorded.judged.judge_from
+    warnings += notes
+    if left_out:
+        warnings.append(
+            f'{run.name}: {counted(left_out, "run")} of undeclared callbacks in processes of '
+            'declared ones take no time: declare them, as mddag graph from-trace does')
     if cpus is not None and run.declared and len(work.load.computed) == 0:
         warnings.append(
             f'{run.name}: CPU times are not recorded in it, so with --cpus each '

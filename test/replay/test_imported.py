@@ -9,6 +9,11 @@ from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.communications import recorded_callbacks
 from msg_graph import loads
 import numpy as np
+
+
+from mddag_executor.replay import open_recording, replay, ReplayError, reschedule
+from mddag_executor.replay.drafting import System
+from msg_graph import load, loads
 import pytest
 
 from .recorded import BEGIN, CAMERA, MS, Recorded, US
@@ -88,8 +93,7 @@ def result_of(path, graph):
 
 def test_jobs_responses_where_the_time_went_and_paths(recorded, graph):
     result, warnings = result_of(recorded.write(), graph)
-    assert warnings == [
-        '2 processes ran callbacks, each with workers of its own: 6 threads are taken together']
+    assert warnings == []
     camera = result['dags']['/camera']
     assert camera['jobs'] == N
     sink = camera['sinks']['/fuse:join']
@@ -356,3 +360,90 @@ def test_callbacks_are_summed_up_in_one_pass():
     assert list(found) == [f'c{n:03}' for n in range(200)]
     assert found['c007'] == {'executions': 4, 'unfinished': 1, 'busy_ns': 28, 'shortest_ns': 7,
                              'longest_ns': 7}
+
+
+SEVERAL = """\
+mddag: 1
+nodes:
+  - {node: /camera, callbacks: [{name: grab, timer: 100ms, publishes: [/image]}]}
+  - node: /detect
+    callbacks:
+      - {name: detect, subscription: /image, deadline: 10ms}
+      - {name: tidy, timer: 200ms, deadline: 100ms}
+"""
+
+
+@pytest.fixture
+def three_processes(tmp_path):
+    """
+    Record ten jobs of /camera and /detect, and the computing /hog, each in its own process.
+
+    In every second job the thread of /detect is busy with its timer when the message arrives; in
+    two others the message is under way for 20 ms.
+    """
+    r = Recorded(tmp_path / 'three.mcap')
+    for pid, tid, name, node in ((1, 1, 'cam', '/camera'), (2, 3, 'det', '/detect'),
+                                 (3, 5, 'hog', '/hog')):
+        r.add('mddag:process', 0, tid, name, pid=pid)
+        r.add('mddag:process', 0, pid, name, pid=pid)
+        r.node(pid, node, pid=pid)
+    r.timer(11, 1, 100 * MS)
+    r.publisher(100, 1, '/image')
+    r.subscription(12, 2, '/image', pid=2)
+    r.timer(13, 2, 200 * MS, pid=2)
+    r.timer(14, 3, 50 * MS, pid=3)
+    for k in range(10, 20):
+        at = k * 100 * MS
+        r.run(11, 1, at, at + 2 * MS)
+        stamp = r.publish(100, 1, at + 1 * MS)
+        start = at + 3 * MS
+        if k % 2 == 0:
+            r.run(13, 3, at, at + 15 * MS, pid=2)
+            start = at + 15 * MS + 100 * US
+        elif k in (11, 13):
+            start = at + 21 * MS
+        r.receive(12, 3, start, start + 2 * MS, stamp, pid=2)
+        for part in (0, 50):
+            r.run(14, 5, at + part * MS, at + (part + 45) * MS, pid=3)
+    return r.write()
+
+
+def test_only_the_own_thread_of_a_callback_makes_it_wait(three_processes):
+    outcome = replay(three_processes, loads(SEVERAL, 'graph.yaml'))
+    result = outcome.explanation.result()
+    assert {cause: n for cause, n in result['causes'].items() if n} == {
+        'waited': 5, 'transport': 2}
+    for job in result['jobs']:
+        behind = [each['callback'] for part in job['parts'] for each in part['behind']]
+        assert behind == (['/detect:tidy'] if job['cause'] == 'waited' else [])
+    assert outcome.recording.worker_names == [
+        'cam 1, thread 1', 'det 2, thread 3', 'hog 3, thread 5']
+    table = outcome.recording.executions
+    assert {*zip(table['process'].tolist(), table['thread'].tolist())} == {(0, 1), (1, 3), (2, 5)}
+
+
+@pytest.mark.parametrize('workers', [None, 1])
+def test_each_recorded_process_has_a_pool_of_its_own(workers, three_processes):
+    graph = loads(SEVERAL, 'graph.yaml')
+    outcome = reschedule(three_processes, graph, workers=workers)
+    result = outcome.result()
+    assert (result['policy'], result['workers']) == ('fifo', 2)
+    assert result['processes'] == [
+        {'name': 'cam', 'nodes': ('/camera',)}, {'name': 'det', 'nodes': ('/detect',)}]
+    sinks = result['dags']['/camera']['sinks']['/detect:detect'], replay(
+        three_processes, graph).result()['dags']['/camera']['sinks']['/detect:detect']
+    assert [(sink['completed'], sink['late']) for sink in sinks] == [(10, 7)] * 2
+    assert any('because ros2 (polling) is known of one process only' in each
+               for each in outcome.warnings)
+    given = reschedule(three_processes, graph, policy='rad', workers=workers)
+    assert not any('polling' in each for each in given.warnings)
+
+
+def test_a_draft_has_the_recorded_processes(three_processes, call, tmp_path):
+    assert System(three_processes).draft().processes == {
+        'cam': ['/camera'], 'det': ['/detect'], 'hog': ['/hog']}
+    graph = tmp_path / 'drafted.yaml'
+    call('graph', 'from-trace', three_processes, '--accept', '-o', graph)
+    assert [each.name for each in load(graph).processes] == ['cam', 'det', 'hog']
+    assert [each.name for each in open_recording(three_processes, load(graph)).placed] == [
+        'cam', 'det', 'hog']
