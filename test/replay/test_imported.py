@@ -5,15 +5,11 @@
 from types import SimpleNamespace
 
 from mddag_executor.recording.tables import EXECUTIONS, rows, UNKNOWN
-from mddag_executor.replay import replay, ReplayError, reschedule
-from mddag_executor.replay.communications import recorded_callbacks
-from msg_graph import loads
-import numpy as np
-
-
 from mddag_executor.replay import open_recording, replay, ReplayError, reschedule
+from mddag_executor.replay.communications import recorded_callbacks
 from mddag_executor.replay.drafting import System
 from msg_graph import load, loads
+import numpy as np
 import pytest
 
 from .recorded import BEGIN, CAMERA, MS, Recorded, US
