@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The verb `top`: the states of executors on `/diagnostics`, live in a terminal.
+The verb `top`: the states of sinks and workers on `/diagnostics`, live in a terminal.
 
 It only listens, so it watches processes on any machine that ROS reaches, and costs them nothing.
 Statuses of others on the topic are left out. On a terminal the tables are renewed in place;
@@ -24,7 +24,7 @@ from mddag_executor.report.board import Board, tables
 
 EXAMPLE = """\
 mddag top
-mddag top --once --json - | jq '.statuses[] | select(.level != "OK")'"""
+mddag top --once --json - | jq '.sinks[] | select(.level != "OK")'"""
 
 TOPIC = '/diagnostics'
 INTERVAL_S = 1.0

@@ -10,9 +10,10 @@ Once a period a separate thread reads the executor's counters and publishes one
 pool.  The thread does not take the engine's lock.  It reads counters while they change; a change
 that it misses shows one period later.
 
-A DAG's status is about its recent results (jobs of its sinks).  STALE: no job has been released
-for a while, and the DAG is neither sporadic nor released only once.  ERROR, WARN: see
-``Thresholds``.  The pool's status is WARN when data was lost: messages beyond a queue's depth,
+A DAG's status is about the recent results of its sinks in this process, and has values for each
+of them, with the sink's name in the key.  Its level is that of the worst sink.  STALE: no job has
+been released for a while, and the DAG is neither sporadic nor released only once.  ERROR, WARN:
+see ``Thresholds``.  The pool's status is WARN when data was lost: messages beyond a queue's depth,
 releases of timers, messages whose job was not found, events of the trace, misses for which
 ``on_deadline_miss`` was too slow.
 
@@ -23,7 +24,7 @@ the host's name and the process, and values are texts with the unit in their key
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 import os
 import socket
@@ -52,6 +53,7 @@ TOPIC = '/diagnostics'
 WORKERS = 'workers'
 NODE_NAME = '_mddag_diagnostics'
 OK, WARN, ERROR, STALE = range(4)
+LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 
 
 class Status(NamedTuple):
@@ -64,12 +66,15 @@ class Status(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """The counters of a DAG at one time."""
+    """The counters of a DAG at one time; ``results`` and ``completed`` by sink."""
 
-    results: Counts
+    results: dict[str, Counts]
     jobs: int
-    completed: list[int]
+    completed: dict[str, int]
     in_stops: int
+
+
+_REASONS = ('late', 'expired', 'aborted', 'failed', 'dropped', 'demoted')
 
 
 class DagWatch:
@@ -78,105 +83,149 @@ class DagWatch:
 
     :param every_ns: the period of the diagnostics.
     :param in_stops: by DAG, the number of misses explained by stops of the machine.
+    :param sinks: the indices of the sinks that this process judges; None: all.
     """
 
     def __init__(
         self, tally: Tally, dag: Dag, thresholds: Thresholds, every_ns: int,
-        in_stops: Sequence[int],
+        in_stops: Sequence[int], sinks: Collection[int] | None = None,
     ) -> None:
         self._tally = tally
         self._dag = dag
         self._thresholds = thresholds
         self._in_stops = in_stops
-        self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
+        judged = {dag.vertices[i].name for i in (dag.sinks if sinks is None else sinks)}
+        self._sinks = {name: sink for v, sink in tally.sinks_of(dag).items()
+                       if (name := tally.vertex_name(v)) in judged}
         # whether silence is no sign of trouble
         self._is_quiet = dag.once or dag.sporadic
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
         # the counters at the end of each period of the window, and before it
         self._seen = deque([self._read()], maxlen=thresholds.window + 1)
+        # by sink, the response times of each period of the window
+        self._responses: deque[dict[str, list[int]]] = deque(maxlen=thresholds.window)
         self._released_at: int | None = None
 
     def _read(self) -> _Seen:
-        sinks = self._sinks.values()
         return _Seen(
-            Counts.total(counts(sink.verdicts()) for sink in sinks),
+            {name: counts(sink.verdicts()) for name, sink in self._sinks.items()},
             self._tally.jobs[self._dag.index],
-            [sink.completed for sink in sinks], self._in_stops[self._dag.index])
+            {name: sink.completed for name, sink in self._sinks.items()},
+            self._in_stops[self._dag.index])
 
     def status(self, now: int) -> Status:
         """Return the status; called once a period (``now``: monotonic ns)."""
         last, seen = self._seen[-1], self._read()
         self._seen.append(seen)
+        self._responses.append(self._new_responses(last, seen))
         if seen.jobs != last.jobs:
             self._released_at = now
-        before, results = self._seen[0], seen.results
-        window = results.minus(before.results)
+        before = self._seen[0]
+        windows = {name: seen.results[name].minus(before.results[name]) for name in self._sinks}
+        results, window = (Counts.total(each.values()) for each in (seen.results, windows))
         in_stops = seen.in_stops - before.in_stops
-        level, message = self._level(results.minus(last.results), window, now, in_stops)
+        silence = self._silence(now)
+        levels = {name: STALE if silence else self._level(
+            seen.results[name].minus(last.results[name]), windows[name]) for name in self._sinks}
         ratio = window.missed / window.due if window.due else 0.0
         values = {
             'period_ms': _ms(self._dag.period_ns), 'jobs': str(seen.jobs),
-            'results': str(results.due), **{key: str(getattr(results, key)) for key in (
-                'missed', 'late', 'expired', 'aborted', 'failed', 'dropped', 'demoted')},
+            'results': str(results.due), 'missed': str(results.missed),
+            **{key: str(getattr(results, key)) for key in _REASONS},
             **self._tolerated(),
             'window_results': str(window.due), 'window_missed': str(window.missed),
             'window_missed_ratio': f'{ratio:.4f}', 'window_in_stops': str(in_stops),
-            **self._response_times(last, seen)}
-        return Status(f'{self._thresholds.name}: {self._dag.name}', level, message, values)
+            **self._response_times()}
+        for name in self._sinks:
+            values.update({f'{key} {name}': value for key, value in self._sink_values(
+                name, levels[name], windows[name], silence).items()})
+        return Status(
+            f'{self._thresholds.name}: {self._dag.name}',
+            STALE if silence else max(levels.values(), default=OK),
+            silence or _message(window, in_stops), values)
 
     def _tolerated(self) -> dict[str, str]:
         """Return the worst window of the sink that is nearest to its tolerance, if any has one."""
         sinks = [(vertex, window) for vertex, window in self._tally.windows.items()
-                 if vertex in self._tally.sinks_of(self._dag)]
+                 if self._tally.vertex_name(vertex) in self._sinks]
         if not sinks:
             return {}
         tolerated = {v: self._tally.tolerated(v) for v, _ in sinks}
         vertex, window = max(sinks, key=lambda item: item[1].worst / tolerated[item[0]])
         return {'worst_window': f'{window.worst} of {window.of}, {tolerated[vertex]} tolerated'}
 
-    def _level(
-        self, step: Counts, window: Counts, now: int, in_stops: int
-    ) -> tuple[int, str]:
-        limits = self._thresholds
-        if not self._is_quiet:
-            if self._released_at is None:
-                return STALE, 'nothing has been released yet'
-            silent = now - self._released_at
-            if silent >= self._stale_after:
-                return STALE, f'nothing has been released for {silent / 1e9:.1f} s'
-        if not window.missed:
-            return OK, f'{counted(window.due, "result")} in time'
-        message = f'{window.missed} of {window.due} results missed their deadlines'
-        if in_stops:
-            message += f', {in_stops} as the machine stood still'
-        if window.missed >= max(
-                limits.warn_burst, limits.error_ratio * window.due):
-            return ERROR, message
-        if step.missed >= limits.warn_burst or window.missed >= limits.warn_ratio * window.due:
-            return WARN, message
-        return OK, message
+    def _silence(self, now: int) -> str:
+        """Return the message of a DAG that releases nothing; empty: it does, or need not."""
+        if self._is_quiet:
+            return ''
+        if self._released_at is None:
+            return 'nothing has been released yet'
+        silent = now - self._released_at
+        return (f'nothing has been released for {silent / 1e9:.1f} s'
+                if silent >= self._stale_after else '')
 
-    def _response_times(self, last: _Seen, seen: _Seen) -> dict[str, str]:
-        """Return the response times of the last period, in parts of their deadlines and in ms."""
-        times: list[int] = []
-        used: list[float] = []
-        margins: dict[str, int] = {}
-        for (name, sink), before, now in zip(self._sinks.items(), last.completed, seen.completed):
+    def _level(self, step: Counts, window: Counts) -> int:
+        """Return the level of a sink by its results of the last period and of the window."""
+        limits = self._thresholds
+        if not window.missed:
+            return OK
+        if window.missed >= max(limits.warn_burst, limits.error_ratio * window.due):
+            return ERROR
+        if step.missed >= limits.warn_burst or window.missed >= limits.warn_ratio * window.due:
+            return WARN
+        return OK
+
+    def _new_responses(self, last: _Seen, seen: _Seen) -> dict[str, list[int]]:
+        """Return the response times of the last period, by sink."""
+        found = {}
+        for name, sink in self._sinks.items():
             # a copy made while others are added may contain one of them twice
             kept = sink.responses
-            found = [kept[-i] for i in range(1, min(now - before, len(kept)) + 1)]
-            times += found
-            if found:
-                margins[name] = sink.relative_deadline_ns - max(found)
-                used.append(max(found) / sink.relative_deadline_ns)
-        if not times:
+            new = min(seen.completed[name] - last.completed[name], len(kept))
+            found[name] = [kept[-i] for i in range(1, new + 1)]
+        return found
+
+    def _response_times(self) -> dict[str, str]:
+        """Return the response times of the last period, in parts of their deadlines and in ms."""
+        found = {name: times for name, times in self._responses[-1].items() if times}
+        if not found:
             return {}
-        times.sort()
+        times = sorted(time for each in found.values() for time in each)
+        deadlines = {name: self._sinks[name].relative_deadline_ns for name in found}
+        used = max(max(each) / deadlines[name] for name, each in found.items())
+        margin = min(deadlines[name] - max(each) for name, each in found.items())
         return {
             'response_p50_ms': _ms(quantile(times, 0.5)),
             'response_p99_ms': _ms(quantile(times, 0.99)), 'response_max_ms': _ms(times[-1]),
-            'deadline_used_max': f'{max(used):.2f}', 'margin_min_ms': _ms(min(margins.values())),
-            **{f'margin_ms {name}': _ms(margin) for name, margin in margins.items()}}
+            'deadline_used_max': f'{used:.2f}', 'margin_min_ms': _ms(margin)}
+
+    def _sink_values(self, name: str, level: int, window: Counts, silence: str) -> dict[str, str]:
+        """Return the values of one sink over the window."""
+        deadline_ns = self._sinks[name].relative_deadline_ns
+        times = sorted(time for period in self._responses for time in period[name])
+        return {
+            'level': LEVELS[level], 'window_results': str(window.due),
+            'in_time_ratio': f'{window.in_time / window.due:.4f}' if window.due else '',
+            'deadline_ms': _ms(deadline_ns),
+            **({'response_p99_ms': _ms(quantile(times, 0.99)),
+                'margin_ms': _ms(deadline_ns - times[-1])} if times else {}),
+            'wrong': silence or _wrong(window)}
+
+
+def _message(window: Counts, in_stops: int) -> str:
+    if not window.missed:
+        return f'{counted(window.due, "result")} in time'
+    message = f'{window.missed} of {window.due} results missed their deadlines'
+    return message + f', {in_stops} as the machine stood still' if in_stops else message
+
+
+def _wrong(window: Counts) -> str:
+    """Return how results of a sink missed their deadlines, the most frequent reason first."""
+    if not window.missed:
+        return ''
+    found = {reason: getattr(window, reason) for reason in _REASONS}
+    return ', '.join(f'{n} {reason}' for reason, n in sorted(
+        found.items(), key=lambda item: -item[1]) if n)
 
 
 def _ms(nanoseconds: int) -> str:
@@ -260,7 +309,10 @@ class Diagnostics:
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
                 {vertex.callback.key for vertex in reported_by},
-                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops)))
+                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops,
+                         None if process is None or task_set is None else [
+                             i for i in dag.sinks if task_set.process_of(
+                                 dag.vertices[i].callback.node) == process])))
         self._pool = PoolWatch(pool, registry, recorder, thresholds, notifier)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None

@@ -4,11 +4,13 @@
 The newest ``/diagnostics`` of executors, and tables of them.
 
 The statuses are those of ``mddag_executor.executor.diagnostics``; others on the topic are ignored.
+A DAG's status has values for each of its sinks, under keys such as
+``in_time_ratio NODE:CALLBACK``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import time
 from typing import Any, NamedTuple
 
@@ -19,23 +21,25 @@ GONE = 'GONE'
 GONE_AFTER_S = 5.0
 MOST_STATUSES = 1000
 
-
-# The key of each column by its title. The most important columns come first: on a narrow terminal
-# the last ones are left out.
-_DAG_COLUMNS = {
-    'DAG': 'name', 'state': 'level', 'results': 'window_results', 'missed': 'window_missed',
-    'p99': 'response_p99_ms', 'of deadline': 'deadline_used_max', 'p50': 'response_p50_ms',
-    'max': 'response_max_ms', 'jobs': 'jobs', 'period': 'period_ms',
-    'least margin': 'margin_min_ms', 'demoted': 'demoted', 'worst window': 'worst_window'}
+# The key of each column by its title.  Columns after `wrong` are left out on a terminal that is
+# too narrow for them.
+_PROCESS = {'process': 'process'}
+_SINK_COLUMNS = {
+    'sink': 'sink', 'state': 'level', 'in time': 'in_time_ratio', 'p99': 'response_p99_ms',
+    'deadline': 'deadline_ms', 'wrong': 'wrong'}
+_FURTHER_COLUMNS = {
+    'results': 'window_results', 'least margin': 'margin_ms', 'DAG': 'dag', 'jobs': 'jobs',
+    'period': 'period_ms', 'worst window': 'worst_window'}
 _POOL_COLUMNS = {
-    'workers of': 'name', 'state': 'level', 'busy': 'busy_ratio', 'CPU': 'cpu_ratio',
+    'workers': 'workers', 'state': 'level', 'busy': 'busy_ratio', 'CPU': 'cpu_ratio',
     'idle': 'idle_workers', 'queue': 'queue', 'dropped': 'dropped', 'per s': 'callbacks_per_s',
     'us each': 'cpu_us_per_callback', 'compute': 'computing', 'lost': 'lost', 'skipped': 'skipped',
     'no job': 'unattributed'}
-_PROCESS, _MESSAGE = {'process': 'process'}, {'message': 'message'}
-_SHARES = ('deadline_used_max', 'busy_ratio', 'cpu_ratio')
-_LEAST = 3          # minimum number of columns
-_MOST_MESSAGES = 5  # messages of statuses that are not OK, below the tables
+_SHARES = ('busy_ratio', 'cpu_ratio')
+_WORST_FIRST = ('ERROR', 'STALE', 'WARN', GONE)
+_LEAST_WIDTHS = {'process': 18, 'sink': 18, 'wrong': 16}     # of columns that can be cut
+_LARGEST = 1e15
+_MOST_MESSAGES = 5  # messages of statuses that are not OK, below the tables on a terminal
 
 
 class Status(NamedTuple):
@@ -49,6 +53,16 @@ class Status(NamedTuple):
     came: float
 
     @property
+    def owner(self) -> str:
+        """Return the prefix of the name (``Thresholds.name``)."""
+        return self.name.partition(': ')[0]
+
+    @property
+    def subject(self) -> str:
+        """Return the name without its prefix: a DAG, or the workers."""
+        return self.name.partition(': ')[2] or self.name
+
+    @property
     def is_pool(self) -> bool:
         """Return whether it is about the workers, not a DAG."""
         return 'idle_workers' in self.values
@@ -57,6 +71,66 @@ class Status(NamedTuple):
     def is_ours(self) -> bool:
         """Return whether an executor of this project has sent it."""
         return self.is_pool or 'window_missed_ratio' in self.values
+
+
+class Sink(NamedTuple):
+    """A sink in the status of its DAG; ``values`` are those of the DAG and its own."""
+
+    process: str
+    dag: str
+    sink: str
+    level: str
+    wrong: str
+    values: dict[str, str]
+
+    def badness(self) -> tuple[Any, ...]:
+        """Return the key of an order that begins with the worst sink."""
+        rank = (_WORST_FIRST.index(self.level) if self.level in _WORST_FIRST
+                else len(_WORST_FIRST))
+        share, response, deadline = (
+            _number(self.values.get(key))
+            for key in ('in_time_ratio', 'response_p99_ms', 'deadline_ms'))
+        return (rank, 1.0 if share is None else share,
+                -response / deadline if response is not None and deadline else 0.0,
+                self.sink, self.process)
+
+    def result(self) -> dict[str, Any]:
+        """Return the sink for JSON."""
+        return {
+            'process': self.process, 'dag': self.dag, 'sink': self.sink, 'level': self.level,
+            'wrong': self.wrong, **{key: _number(self.values.get(key)) for key in (
+                'window_results', 'in_time_ratio', 'response_p99_ms', 'deadline_ms',
+                'margin_ms')}}
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        number = float(text or '')
+    except ValueError:
+        return None
+    return number if abs(number) < _LARGEST else None   # also without NaN
+
+
+def sinks_of(statuses: Sequence[Status]) -> list[Sink]:
+    """Return the sinks in statuses of DAGs, the worst first."""
+    found = []
+    for status in statuses:
+        if status.is_pool:
+            continue
+        sinks: dict[str, dict[str, str]] = {}
+        for key, value in status.values.items():
+            what, _, sink = key.partition(' ')
+            if sink:
+                sinks.setdefault(sink, {})[what] = value
+        of_dag = {key: status.values.get(key, '') for key in _FURTHER_COLUMNS.values()
+                  if key not in ('window_results', 'margin_ms')}
+        for sink, values in sinks.items():
+            is_gone = status.level == GONE
+            found.append(Sink(
+                status.process, status.subject, sink,
+                GONE if is_gone else values.get('level', status.level),
+                status.message if is_gone else values.get('wrong', ''), {**of_dag, **values}))
+    return sorted(found, key=Sink.badness)
 
 
 class Board:
@@ -90,56 +164,104 @@ class Board:
             for _, s in sorted(self._statuses.items())]
 
     def result(self) -> dict[str, Any]:
-        """Return the statuses for JSON."""
-        return {'statuses': [
-            {key: value for key, value in s._asdict().items() if key != 'came'}
-            for s in self.statuses()]}
+        """Return sinks, the worst first, and statuses for JSON."""
+        statuses = self.statuses()
+        return {
+            'sinks': [sink.result() for sink in sinks_of(statuses)],
+            'statuses': [{key: value for key, value in s._asdict().items() if key != 'came'}
+                         for s in statuses]}
 
 
 def tables(statuses: list[Status], width: int | None = None) -> str:
     """
-    Return the tables of DAGs (one for all processes) and workers.
+    Return the tables of sinks and of workers, and messages that are in neither of them.
 
-    :param width: of a terminal: only the columns that fit, and the messages below; None: all.
+    :param width: of a terminal: only the columns that fit, and the first messages; None: all.
     """
-    dags = sorted((s for s in statuses if not s.is_pool), key=lambda s: (s.name, s.process))
-    pools = [s for s in statuses if s.is_pool]
-    parts = [_table(columns, rows, width) for columns, rows in (
-        (_DAG_COLUMNS, dags), (_POOL_COLUMNS, pools)) if rows]
+    sinks, pools = sinks_of(statuses), [s for s in statuses if s.is_pool]
+    labels = _labels(statuses)
+    is_several = width is None or len(labels) > 1
+    parts = []
+    if sinks:
+        columns = _columns(
+            {**(_PROCESS if is_several else {}), **_SINK_COLUMNS, **_FURTHER_COLUMNS}, sinks,
+            labels)
+        parts.append(_table(columns, [s.level for s in sinks], width, set(_FURTHER_COLUMNS)))
+    if pools:
+        columns = _columns({**(_PROCESS if is_several else {}), **_POOL_COLUMNS}, pools, labels)
+        further = set(list(_POOL_COLUMNS)[2:])
+        parts.append(_table(columns, [s.level for s in pools], width, further))
+    shown = {(sink.process, sink.dag) for sink in sinks}
+    lines = [printable(' '.join([
+        s.level, *([labels[s.process]] if is_several else []), f'{s.subject}: {s.message}']))
+        for s in statuses
+        if s.level != 'OK' and (s.is_pool or (s.process, s.subject) not in shown)]
     if width is not None:
-        parts.append(''.join(
-            printable(f'{s.level} {s.name}: {s.message}')[:width] + '\n'
-            for s in [s for s in statuses if s.level != 'OK'][:_MOST_MESSAGES]))
+        lines = [line[:width] for line in lines[:_MOST_MESSAGES]]
+    if lines:
+        parts.append(''.join(line + '\n' for line in lines))
     return '\n'.join(parts)
 
 
-def _table(keys: dict[str, str], rows: Sequence[Status], width: int | None) -> str:
-    """Return a table; on a terminal it has the process only if there are several."""
-    if width is None:
-        keys = {**_PROCESS, **keys, **_MESSAGE}
-    elif len({s.process for s in rows}) > 1:
-        keys = {**_PROCESS, **keys}
-    columns = [[title, *(_cell(s, key) for s in rows)] for title, key in keys.items()]
-    while width is not None and len(columns) > _LEAST and sum(
-            max(map(len, column)) + 2 for column in columns) - 2 > width:
-        columns.pop()
-    header, *body = zip(*columns)
-    return table(header, body, most=width,
-                 marked=[width is not None and s.level not in ('OK', GONE) for s in rows])
+def _labels(statuses: Sequence[Status]) -> dict[str, str]:
+    """Return how to call each process: by the prefix of its names if all of them differ."""
+    owners = {s.process: s.owner for s in statuses}
+    is_named = len(owners) > 1 and len(set(owners.values())) == len(owners)
+    return owners if is_named else {process: process for process in owners}
 
 
-def _cell(status: Status, key: str) -> str:
-    if key == 'name' and status.is_pool:
-        return printable(status.name.rpartition(': ')[0] or status.name)
-    if key in Status._fields:
-        return printable(getattr(status, key))
-    value = status.values.get(key) or '-'
-    try:
-        number = float(value)
-        if key in _SHARES:
-            return f'{100 * number:.0f} %'
-        if key.endswith('_ms'):
-            return format_ns(round(number * 1e6), 3)
-        return f'{number:.0f}'
-    except (ValueError, OverflowError):
-        return printable(value)     # no number
+def _columns(
+    keys: Mapping[str, str], rows: Sequence[Status | Sink], labels: Mapping[str, str]
+) -> dict[str, list[str]]:
+    """Return the cells of columns by title, without columns that are empty in all rows."""
+    found = {title: [_cell(row, key, labels) for row in rows] for title, key in keys.items()}
+    return {title: cells for title, cells in found.items()
+            if title not in ('wrong', 'worst window') or any(cells)}
+
+
+def _table(
+    columns: dict[str, list[str]], levels: Sequence[str], width: int | None, further: set[str]
+) -> str:
+    """Return a table; on a terminal without the last columns that have no room."""
+    columns = dict(columns)
+    if width is not None:
+        whole = {title: max(map(len, (title, *cells))) for title, cells in columns.items()}
+        least = {title: min(n, _LEAST_WIDTHS.get(title, n)) for title, n in whole.items()}
+        while len(columns) > 1 and (
+                _width(whole if (last := next(reversed(columns))) in further else least, columns)
+                > width):
+            del columns[last]
+        for title in ('wrong', 'sink'):
+            if title in columns:
+                room = max(_LEAST_WIDTHS[title], width - _width(whole, columns) + whole[title])
+                columns[title] = [_cut(text, room, title == 'sink') for text in columns[title]]
+                whole[title] = max(map(len, (title, *columns[title])))
+    return table(list(columns), list(zip(*columns.values())), most=width,
+                 marked=[width is not None and level not in ('OK', GONE) for level in levels])
+
+
+def _cut(text: str, most: int, is_name: bool) -> str:
+    """Cut the end of a text, or the beginning of a name (its namespace)."""
+    if len(text) <= most:
+        return text
+    return '…' + text[1 - most:] if is_name else text[:most - 1] + '…'
+
+
+def _width(widths: Mapping[str, int], titles: Mapping[str, Any]) -> int:
+    return sum(widths[title] + 2 for title in titles) - 2
+
+
+def _cell(row: Status | Sink, key: str, labels: Mapping[str, str]) -> str:
+    if key == 'process':
+        return printable(labels[row.process])
+    if key in row._fields:
+        return printable(getattr(row, key))
+    text = row.values.get(key) or ''
+    number = _number(text)
+    if number is None:
+        return printable(text) or ('' if key == 'worst_window' else '-')
+    if key == 'in_time_ratio':
+        return f'{round(1e4 * number) // 10 / 10:g} %'      # 99.96 % is not 100 %
+    if key in _SHARES:
+        return f'{100 * number:.0f} %'
+    return format_ns(round(number * 1e6), 3) if key.endswith('_ms') else f'{number:.0f}'

@@ -61,12 +61,40 @@ def test_levels_follow_the_share_of_misses_in_the_window():
     assert (status.level, status.message) == (
         WARN, '1 of 100 results missed their deadlines, 1 as the machine stood still')
     assert status.values['margin_min_ms'] == '-10.000'
-    assert status.values[f'margin_ms {tally.vertex_name(sink)}'] == '-10.000'
+    name = tally.vertex_name(sink)
+    assert {key: status.values[f'{key} {name}'] for key in (
+        'level', 'window_results', 'in_time_ratio', 'response_p99_ms', 'deadline_ms', 'margin_ms',
+        'wrong')} == {
+        'level': 'WARN', 'window_results': '100', 'in_time_ratio': '0.9900',
+        'response_p99_ms': '20.000', 'deadline_ms': '50.000', 'margin_ms': '-10.000',
+        'wrong': '1 late'}
+    others = [tally.vertex_name(v) for v in tables.sinks if v != sink]
+    assert [status.values[f'in_time_ratio {other}'] for other in others] == [''] * len(others)
     assert status.values['window_missed_ratio'] == '0.0100'
     status = after(in_time=20, expired=30)
     assert (status.level, status.values['expired']) == (ERROR, '30')
+    assert status.values[f'wrong {name}'] == '30 expired, 1 late'
     levels = [after(in_time=50).level for _ in range(3)]
     assert levels == [ERROR, ERROR, OK]  # the window has moved on
+
+
+def test_a_dag_is_as_bad_as_its_worst_sink_and_has_no_sinks_of_other_processes():
+    task_set = loads(graph(
+        source='name: tick, timer: 20ms, publishes: [/x], dag: d',
+        **{f'sink{i}': 'name: cb, subscription: /x, deadline: 50ms' for i in range(30)}))
+    tables = Tables.build(task_set)
+    tally = Tally(task_set, tables)
+    dag = task_set.dags[0]
+    watches = [DagWatch(tally, dag, Thresholds(), SECOND, [0], sinks)
+               for sinks in (None, dag.sinks[1:])]
+    for job in range(10):
+        tally.released(0)
+        tally.add((SINK_LATE if v == tables.sinks[0] else SINK_IN_TIME, 0, v, job, 50_000_000,
+                   60_000_000 if v == tables.sinks[0] else 1_000_000) for v in tables.sinks)
+    every, others = (watch.status(SECOND) for watch in watches)
+    assert (every.level, every.values['window_missed_ratio']) == (ERROR, '0.0333')  # 10 of 300
+    assert (others.level, others.values['window_results']) == (OK, '290')
+    assert 'level /sink0:cb' not in others.values and 'level /sink1:cb' in others.values
 
 
 @pytest.mark.parametrize('wrong', [
