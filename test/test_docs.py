@@ -39,6 +39,7 @@ EXTRAS = {
     'README.md': ('rclpy',),
     'docs/laboratory.md': ('matplotlib', 'distributed'),
     'docs/figures.md': ('matplotlib',),
+    'docs/patterns.md': ('rclpy',),
     'docs/run.md': ('rclpy',),
     'docs/start.md': ('rclpy',),
     'docs/tables.md': ('pyarrow', 'pandas', 'duckdb'),
