@@ -120,6 +120,22 @@ def test_robot():
     assert computing.startswith('computing in Python: /')
 
 
+def test_ordinary_robot():
+    """The verdicts are what the nodes' own time stamps say."""
+    found = {m[1]: tuple(map(int, m.groups()[1:])) for m in map(re.compile(
+        r'(\S+): itself (\d+) results, (\d+) late; judged (\d+) results, (\d+) late, '
+        r'(\d+) not due in (\d+) jobs').fullmatch, run('ordinary_robot').splitlines())}
+    assert set(found) == {'/brake:stop', '/planner:plan', '/panel:lamp', '/panel:pressed'}
+    for own, own_late, completed, late, _, _ in found.values():
+        assert 0 <= own - completed <= 1    # one may have expired on a busy machine
+        assert own_late <= late     # the verdicts also count how late a timer was
+    own, own_late, _, _, not_due, jobs = found['/brake:stop']
+    assert own_late >= 1
+    assert 0 <= jobs - own - not_due <= 3 and not_due >= own   # so many are open at the end
+    assert found['/panel:lamp'][0] == found['/panel:lamp'][5] == 1
+    assert found['/panel:pressed'][0] >= 1
+
+
 def test_third_party(tmp_path):
     output = run('third_party', '--json', tmp_path / 'result.json')
     heard = re.search(r'^heard (\d+) messages$', output, re.MULTILINE)
