@@ -364,8 +364,8 @@ class WorkerPool:
             self.engine.verdicts.stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:
                 self._new_thread()
-            if not self.polling:
-                self._admit()
+            # one that did not leave after the last spin (``pause``) is asleep, and not parked
+            self._wake_one()
 
     def pause(self) -> None:
         """Start no more executions; running ones finish.  No thread waits in the epoll then."""

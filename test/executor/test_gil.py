@@ -319,6 +319,7 @@ def test_a_task_holds_the_gil_if_its_function_does(make_executor, make_node, is_
         executor.create_task(function)
         assert wait_for(lambda: lending.ran == ['task'])
         lending.wait_in_queue('patient')
+        assert not wait_for(lambda: 'patient' in lending.ran, 0.1)  # nor soon
         lending.leave.set()
         assert wait_for(lambda: lending.ran == ['task', 'patient'])
 

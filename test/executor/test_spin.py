@@ -11,6 +11,7 @@ import threading
 import time
 
 from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor import workers
 from mddag_executor.executor.shutdown import call_at_shutdown
 import pytest
 import rclpy
@@ -118,6 +119,23 @@ def test_a_callback_that_outlasts_a_spin_leaves_the_next_ones_to_spin_once(make_
         executor.spin_once(10.0)
         assert len(ran) == number + 1
     assert {*ran} == {threading.get_ident()}
+
+
+def test_a_spin_wakes_a_worker_that_did_not_leave_after_the_last_one(make_executor, monkeypatch):
+    """As it was not scheduled in time, or a second interrupt ended the wait for it."""
+    executor = make_executor(num_workers=1)
+    pool, future = executor._pool, Future()
+    with monkeypatch.context() as patched:
+        patched.setattr(workers, 'END_S', 0.0)
+        patched.setattr(pool.loop, 'wake_all', lambda: None)
+        patched.setattr(pool.loop, 'let_wait', lambda: None)
+        threading.Thread(
+            target=lambda: wait_for(lambda: pool.polling) and future.set_result(1)).start()
+        executor.spin_until_future_complete(future, 10.0)
+    assert future.done() and pool.polling == 1
+    task = executor.create_task(int)
+    executor.spin_until_future_complete(task, 10.0)
+    assert task.done()
 
 
 def test_spinning_twice_is_an_error(make_executor):
