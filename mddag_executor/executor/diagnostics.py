@@ -24,13 +24,13 @@ the host's name and the process, and values are texts with the unit in their key
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Container, Sequence
 from contextlib import suppress
 import os
 import socket
 import threading
 import time
-from typing import NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import quantile
 from mddag_executor.core.tally import Counts, counts, Tally
@@ -83,20 +83,18 @@ class DagWatch:
 
     :param every_ns: the period of the diagnostics.
     :param in_stops: by DAG, the number of misses explained by stops of the machine.
-    :param sinks: the indices of the sinks that this process judges; None: all.
     """
 
     def __init__(
         self, tally: Tally, dag: Dag, thresholds: Thresholds, every_ns: int,
-        in_stops: Sequence[int], sinks: Collection[int] | None = None,
+        in_stops: Sequence[int],
     ) -> None:
         self._tally = tally
         self._dag = dag
         self._thresholds = thresholds
         self._in_stops = in_stops
-        judged = {dag.vertices[i].name for i in (dag.sinks if sinks is None else sinks)}
-        self._sinks = {name: sink for v, sink in tally.sinks_of(dag).items()
-                       if (name := tally.vertex_name(v)) in judged}
+        self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
+        self._keys = {dag.vertices[i].name: dag.vertices[i].callback.key for i in dag.sinks}
         # whether silence is no sign of trouble
         self._is_quiet = dag.once or dag.sporadic
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
@@ -113,8 +111,13 @@ class DagWatch:
             {name: sink.completed for name, sink in self._sinks.items()},
             self._in_stops[self._dag.index])
 
-    def status(self, now: int) -> Status:
-        """Return the status; called once a period (``now``: monotonic ns)."""
+    def status(self, now: int, hosted: Container[Any]) -> Status:
+        """
+        Return the status; called once a period.
+
+        :param now: monotonic ns.
+        :param hosted: the keys of the callbacks in this process.
+        """
         last, seen = self._seen[-1], self._read()
         self._seen.append(seen)
         self._responses.append(self._new_responses(last, seen))
@@ -137,6 +140,8 @@ class DagWatch:
             'window_missed_ratio': f'{ratio:.4f}', 'window_in_stops': str(in_stops),
             **self._response_times()}
         for name in self._sinks:
+            if self._keys[name] not in hosted and not seen.results[name].due:
+                continue    # another process judges it
             values.update({f'{key} {name}': value for key, value in self._sink_values(
                 name, levels[name], windows[name], silence).items()})
         return Status(
@@ -309,10 +314,7 @@ class Diagnostics:
                 dag.vertices[i] for i in (dag.source, *dag.sinks)]
             self._dags.append((
                 {vertex.callback.key for vertex in reported_by},
-                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops,
-                         None if process is None or task_set is None else [
-                             i for i in dag.sinks if task_set.process_of(
-                                 dag.vertices[i].callback.node) == process])))
+                DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops)))
         self._pool = PoolWatch(pool, registry, recorder, thresholds, notifier)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
@@ -321,7 +323,8 @@ class Diagnostics:
         """Return a status for each DAG with a callback here, and the pool's."""
         now = time.monotonic_ns()
         hosted = self._registry.hosted()
-        found = [watch.status(now) for keys, watch in self._dags if not keys.isdisjoint(hosted)]
+        found = [watch.status(now, hosted) for keys, watch in self._dags
+                 if not keys.isdisjoint(hosted)]
         return [*found, self._pool.status(now)]
 
     def start(self) -> None:

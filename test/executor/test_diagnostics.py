@@ -43,6 +43,7 @@ def test_levels_follow_the_share_of_misses_in_the_window():
     sink = next(v for v in tables.sinks if tables.sink_deadline[v] == 50_000_000)
     in_stops, jobs, seconds = [0], itertools.count(), itertools.count(2)
     watch = DagWatch(tally, task_set.dags[0], Thresholds(window=3), SECOND, in_stops)
+    hosted = {vertex.callback.key for vertex in task_set.dags[0].vertices}
 
     def after(in_time=0, late=0, expired=0):
         for kind, count, response in (
@@ -52,7 +53,7 @@ def test_levels_follow_the_share_of_misses_in_the_window():
             for _ in range(count):
                 tally.released(0)
                 tally.add([(kind, 0, sink, next(jobs), 50_000_000, response)])
-        return watch.status(next(seconds) * SECOND)
+        return watch.status(next(seconds) * SECOND, hosted)
 
     assert after().level == STALE
     assert after(in_time=50).level == OK
@@ -85,16 +86,18 @@ def test_a_dag_is_as_bad_as_its_worst_sink_and_has_no_sinks_of_other_processes()
     tables = Tables.build(task_set)
     tally = Tally(task_set, tables)
     dag = task_set.dags[0]
-    watches = [DagWatch(tally, dag, Thresholds(), SECOND, [0], sinks)
-               for sinks in (None, dag.sinks[1:])]
+    watch = DagWatch(tally, dag, Thresholds(), SECOND, [0])
     for job in range(10):
         tally.released(0)
         tally.add((SINK_LATE if v == tables.sinks[0] else SINK_IN_TIME, 0, v, job, 50_000_000,
-                   60_000_000 if v == tables.sinks[0] else 1_000_000) for v in tables.sinks)
-    every, others = (watch.status(SECOND) for watch in watches)
-    assert (every.level, every.values['window_missed_ratio']) == (ERROR, '0.0333')  # 10 of 300
-    assert (others.level, others.values['window_results']) == (OK, '290')
-    assert 'level /sink0:cb' not in others.values and 'level /sink1:cb' in others.values
+                   60_000_000 if v == tables.sinks[0] else 1_000_000) for v in tables.sinks[:20])
+    here = {vertex.callback.key for vertex in dag.vertices if vertex.name != '/sink29:cb'}
+    status = watch.status(SECOND, here)
+    assert (status.level, status.values['window_missed_ratio']) == (ERROR, '0.0500')  # 10 of 200
+    assert status.values['level /sink0:cb'] == 'ERROR'
+    assert status.values['in_time_ratio /sink1:cb'] == '1.0000'
+    assert status.values['in_time_ratio /sink28:cb'] == ''
+    assert 'level /sink29:cb' not in status.values
 
 
 @pytest.mark.parametrize('wrong', [
