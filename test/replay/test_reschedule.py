@@ -9,6 +9,7 @@ from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import PREEMPT, Settings, simulate, START
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import Load
+from mddag_executor.trace.schema import GOES_ON
 from msg_graph import loads, Process
 import pytest
 
@@ -138,8 +139,8 @@ nodes:
     trace.run(0, 0, 0, 20, 23, ready=0)
     trace.run(0, 1, 0, 25, 26, leg=1, whole=False)
     trace.run(0, 1, 0, 30, 36)
-    for start in (50, 70):      # an undeclared coroutine
-        trace.piece(-1, -1, -1, start, start + 1, ready=49)
+    for job, start in ((GOES_ON, 50), (-1, 70)):    # an undeclared coroutine
+        trace.piece(-1, -1, job, start, start + 1, ready=49)
     path = trace.end(90)
     found = [[((start - ns(0)) / MS, (entry[0] - ns(0)) / MS) for start, entry
               in executions(reschedule(path, overheads=overheads).log)]
