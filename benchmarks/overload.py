@@ -41,7 +41,7 @@ EXAMPLE = """\
 python -m benchmarks overload --graph config/autoware.yaml --duration 3s
 python -m benchmarks overload --sets 1000 --plot overload.svg"""
 
-WAYS = ('continue', 'demote', 'abort', 'fifo', 'important', 'alone')
+WAYS = ('continue', 'demote', 'fifo', 'important', 'alone')
 LOADS = (0.9, 1.0, 1.1, 1.2, 1.5, 2.0)
 
 
@@ -124,7 +124,7 @@ class _Case:
         """Add the share of results in time of each way."""
         tables, load = self._tables, self._load
         every = range(tables.n_dags)
-        for on_late in ('continue', 'demote', 'abort'):
+        for on_late in ('continue', 'demote'):
             shares[on_late].append(self._share('rad', on_late, tables, load, every))
         shares['fifo'].append(self._share('fifo', 'continue', tables, load, every))
         marked = tables._replace(importance=[
@@ -157,7 +157,7 @@ def draw(rows: list[dict[str, Any]], file: BinaryIO) -> None:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     styles = dict(zip(WAYS, (
-        '#D55E00-', '#0072B2-', '#009E73-', '#000000:', '#CC79A7-', '#CC79A7:')))
+        '#D55E00-', '#0072B2-', '#000000:', '#CC79A7-', '#CC79A7:')))
     with rc_context({'svg.hashsalt': 'mddag', 'svg.fonttype': 'none', 'font.size': 9.0}):
         figure = Figure(figsize=(8.0, 5.0), layout='constrained')
         for axes, mode in zip(figure.subplots(2, 2, sharex=True, sharey=True).flat, MODES):

@@ -278,9 +278,17 @@ def name(what: Name) -> Kind:
     return scalar(what.check, what.schema)
 
 
-def choice(*words: str, missing: str | None = None) -> Kind:
-    """Return the kind of a choice of words."""
+def choice(
+    *words: str, missing: str | None = None, gone: Table[str, str] | None = None
+) -> Kind:
+    """
+    Return the kind of a choice of words.
+
+    :param gone: words of earlier versions, and what to do instead.
+    """
     def parse(word: str) -> str:
+        if gone is not None and word in gone:
+            raise ValueProblem(f'{shown(word)} is gone', gone[word])
         if word not in words:
             raise ValueProblem(f'{shown(word)} is not known',
                                did_you_mean(word, words, f'use {", ".join(words)}'))
@@ -486,7 +494,8 @@ CALLBACK_KEYS = {
                              'computes with the lock of the interpreter released (false).'),
     'group': Key(name(GROUP), 'Its mutually exclusive callback group in the node.'),
     'dag': Key(name(DAG), 'Name of the DAG that it is the source of.', of=('source',)),
-    'on_late': Key(choice('continue', 'demote', 'abort'),
+    'on_late': Key(choice('continue', 'demote', gone={
+        'abort': "use 'demote', or 'keep: newest' to drop what a newer message replaces"}),
                    'What is done with a late job of its DAG, if it is a source.', of=('source',)),
     'keep': Key(choice('all', 'newest', missing='all'),
                 'Of a source or sink: newest drops what has not started when the next is ready.',

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 Kind = Literal['timer', 'subscription', 'sync', 'service']
 ReleaseFrom = Literal['arrival', 'source_timestamp', 'header_stamp']
-OnLate = Literal['continue', 'demote', 'abort']
+OnLate = Literal['continue', 'demote']
 Keep = Literal['all', 'newest']
 Importance = Literal['high', 'normal', 'low']
 

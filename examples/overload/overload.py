@@ -1,12 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A node that is too slow for its rate: its late jobs are aborted, others keep their deadlines.
+A node that is too slow for its rate: its late jobs go behind, others keep their deadlines.
 
     python examples/overload/overload.py
 
 It runs twice.  With a queue of ten images, the segmentation is always busy with one that is nearly
-late, and most jobs are aborted.  With a queue of one, it uses the newest, and every image that it
+late, and few jobs are in time.  With a queue of one, it uses the newest, and every image that it
 starts with has a result in time.  An executor cannot make a node faster.  But only one DAG misses
 deadlines, all misses are counted, and what is dropped early costs nothing.
 """

@@ -203,7 +203,7 @@ def give_up(t: Tables, s: State, slot: int, end: int, now: int) -> None:
     """
     End an open job early: each sink that has not completed is missed.
 
-    :param end: ABORTED (rule 7), EXPIRED (rules 1 and 8), FAILED (rule 8), or OUTDATED (rule 13).
+    :param end: EXPIRED (rules 1 and 8), FAILED (rule 8), or OUTDATED (rule 13).
     """
     judge_incomplete(t, s, slot, SINK_ABORTED + end - ABORTED, -NEVER, NEVER)
     close_job(s, slot, end, now)

@@ -19,7 +19,6 @@ from heapq import heappop, heappush
 from mddag_executor.core.jobs import demotes, judge
 from mddag_executor.core.queues import add_stale
 from mddag_executor.core.state import (
-    ABORTED,
     DEADLINE_KEYS,
     ELSEWHERE,
     OPEN,
@@ -163,8 +162,7 @@ def is_late(t: Tables, s: State, x: int, now: int) -> bool:
 def pass_on_age(t: Tables, s: State, x: int, now: int) -> None:
     """Let the next execution of a vertex go as early as this one, which is about to be dropped."""
     slot, vertex = s.x_slot[x], s.x_vertex[x]
-    if (vertex == t.n_vertices or s.scalars[URGENCY] == OTHER_KEYS
-            or s.job_state[slot] == ABORTED):
+    if vertex == t.n_vertices or s.scalars[URGENCY] == OTHER_KEYS:
         return
     if s.job_hope[slot] < NEVER and s.job_demoted[slot] < 0 and s.job_state[slot] == OPEN:
         late_priority(t, s, x, -1, now)  # demotes its job if that is late

@@ -29,7 +29,6 @@ from __future__ import annotations
 from heapq import heapify, heappop, heappush
 
 from mddag_executor.core.state import (
-    ABORTED,
     N_HOLDING,
     N_STALE,
     QueueEntry,
@@ -229,8 +228,7 @@ def poll(t: Tables, s: State) -> None:
                 s.scalars[N_STALE] -= 1
             else:
                 heappush(s.ready, entry)
-                # Aborted executions are moved only to be dropped.
-                waits = entity == t.n_entities or s.job_state[s.x_slot[entry[4]]] == ABORTED
+                waits = entity == t.n_entities
         if queue:
             s.unpolled[kept] = entity
             kept += 1

@@ -42,13 +42,11 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     its verdict, which is then not in time.  Jobs released less than ``SKIP`` after the first one
     (warm-up), before ``JUDGE_FROM``, or not before ``JUDGE_UNTIL``, get no verdicts; live,
     ``judge_from`` is called when all programs have started.
-7.  **Late jobs.**  ``CONTINUE`` lets a late job go on.  ``ABORT`` drops its waiting executions
-    once the miss is known: at a late completion, or when one of them comes first in the ready
-    queue after the deadline of an incomplete sink; started ones finish.  ``DEMOTE`` lowers the
-    priority of an execution that comes first in a queue, if none of its sinks can be in time: the
-    time plus the mean execution times on the longest path to the sink is past its deadline.  From
-    then on its job counts as released ``LATE_PATIENCE`` relative deadlines later.  So demoted jobs
-    age, and each callback gets some time.  An execution with sinks of both kinds has as RAD the
+7.  **Late jobs.** ``CONTINUE`` lets a late job go on as before.  ``DEMOTE`` lowers the priority of
+    an execution that comes first in a queue, if none of its sinks can be in time: the time plus
+    the mean execution times on the longest path to the sink is past its deadline.  From then on
+    its job counts as released ``LATE_PATIENCE`` relative deadlines later.  So demoted jobs age,
+    and each callback gets some time.  An execution with sinks of both kinds has as RAD the
     earliest deadline of those that can be in time.  Executions of one vertex keep their order: one
     that comes first while older ones are demoted has to wait for these.  If it can be in time, the
     oldest inherits its priority, so a backlog is worked off; if not, it is demoted behind the
@@ -60,12 +58,12 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     it is late, past its deadline, it counts as ready ``LATE_PATIENCE`` relative deadlines later,
     and so does each that follows it until its queue has been empty.  So an overload of undeclared
     callbacks never makes a declared deadline miss for long, and each gets its turn.
-8.  **Ends.**  A job ends as exactly one of completed, late, aborted, expired, failed.  It fails
+8.  **Ends.** A job ends as exactly one of completed, late, expired, failed, outdated.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
-    Executions that have not started are dropped after an abort.  After an expiry or a failure they
-    run (live: each has a message, which is never lost silently), but make no further edge true and
-    are not judged.  Later failures change nothing.  The slot is free when no execution of the job
-    waits, runs or is suspended.
+    Executions that have not started when their job expires or fails run (live: each has a message,
+    which is never lost silently), but make no further edge true and are not judged.  Later
+    failures change nothing.  The slot is free when no execution of the job waits, runs or is
+    suspended.
 9.  **Polling.**  Under a policy that polls (``ros2``) the ready queue is the result of the last
     poll.  When an idle worker finds it empty, it polls: the first waiting execution of every
     entity (timer, subscription, …) forms the next round.  Executions that become ready later wait
@@ -114,7 +112,6 @@ from mddag_executor.core.jobs import (
     demotes,
     give_up,
     judge,
-    next_deadline,
     outdate_sink,
 )
 from mddag_executor.core.overload import (
@@ -136,7 +133,6 @@ from mddag_executor.core.queues import (
     wait_for_poll,
 )
 from mddag_executor.core.state import (
-    ABORTED,
     add_slot,
     COMPLETED,
     DISPATCH_OVERHEAD,
@@ -164,7 +160,7 @@ from mddag_executor.core.state import (
     SWITCH_OVERHEAD,
     WAITING,
 )
-from mddag_executor.core.tables import ABORT, KEEP_ALL, KEEP_NEWEST, NEVER, Tables
+from mddag_executor.core.tables import KEEP_ALL, KEEP_NEWEST, NEVER, Tables
 
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
@@ -341,7 +337,7 @@ def peek(t: Tables, s: State, now: int) -> int:
     """
     Return the execution that is dispatched next, or -1 when none may run.
 
-    Entries that cannot be next leave the queue: dropped and aborted executions for good, those
+    Entries that cannot be next leave the queue: dropped executions for good, those
     with a busy group into the group's heap (rule 4) or to the next poll (rule 9), those that may
     not start into a heap of deferred ones (rules 11 and 12).  Late ones are demoted (rule 7).
     """
@@ -368,19 +364,8 @@ def peek(t: Tables, s: State, now: int) -> int:
             elif ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
                     and not may_start(t, s, entry)):
                 _defer(s, queue)
-            elif vertex == t.n_vertices:
-                return x
             else:
-                slot = s.x_slot[x]
-                if s.job_state[slot] == OPEN:
-                    if (t.on_late[s.job_dag[slot]] != ABORT
-                            or next_deadline(t, s, slot, -NEVER) >= now):
-                        return x
-                    give_up(t, s, slot, ABORTED, now)
-                if s.job_state[slot] != ABORTED or s.x_started[x] >= 0:
-                    return x
-                drop(t, s, x, now)
-                again = True
+                return x
             queue = next_queue(t, s, False)
         if not again or len(s.unpolled) == 0:
             return -1
@@ -612,8 +597,6 @@ def _complete_vertex(
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
-        elif late and t.on_late[s.job_dag[slot]] == ABORT:
-            give_up(t, s, slot, ABORTED, now)
     if s.scalars[PROPAGATE] == 1:  # a sink, which may have ended the job, has no successors
         for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
             edge(t, s, key, slot, t.successors[i], now)

@@ -19,7 +19,8 @@ from mddag_executor.core.tables import NEVER, Tables
 # States of an execution; a refused one is suspended, too.
 IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
 
-# States of a job.  Every ended job is in exactly one of the last six.
+# States of a job.  Every ended job is in exactly one of the last six; only recordings of version 2
+# and before have aborted ones.
 FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 
 # Where a vertex is expected to run; LEADS_OUT: here, and a successor is not.

@@ -77,13 +77,13 @@ UNJUDGED_PERIODS = 10
 UNJUDGED_NS = 1_000_000_000
 """… and at least this long."""
 
-CONTINUE, DEMOTE, ABORT = range(3)
+CONTINUE, DEMOTE = range(2)
 KEEP_ALL, KEEP_TIMELY, KEEP_NEWEST = range(3)
 """Which waiting executions remain when the next one is ready (rule 13)."""
 IMPORTANCE = {'low': 0, 'normal': 1, 'high': 2}
 IMPORTANT = 2
 """The highest importance."""
-ON_LATE = {'continue': CONTINUE, 'demote': DEMOTE, 'abort': ABORT}
+ON_LATE = {'continue': CONTINUE, 'demote': DEMOTE}
 """The treatments of late jobs, by their names in declarations and options."""
 
 _WAIT_SET = {'timer': 0, 'subscription': 1, 'sync': 1, 'service': 2}

@@ -58,8 +58,8 @@ class Counts(NamedTuple):
     """
     Verdicts about the jobs of one or several sinks; ``late`` includes the overdue.
 
-    Demoted jobs have another verdict as well.  Jobs in which the sink was not due are not among
-    the ``due``.
+    Demoted jobs have another verdict as well; only recordings of version 2.0 and before have
+    aborted ones.  Jobs in which the sink was not due are not among the ``due``.
     """
 
     due: int
@@ -174,7 +174,8 @@ class SinkTally:
         return {
             'completed': self.completed, 'late': numbers[SINK_LATE] + overdue, 'overdue': overdue,
             'expired': numbers[SINK_EXPIRED], 'failed': numbers[SINK_FAILED],
-            'aborted': numbers[SINK_ABORTED], 'dropped': numbers[SINK_DROPPED],
+            'dropped': numbers[SINK_DROPPED],
+            **({'aborted': numbers[SINK_ABORTED]} if numbers[SINK_ABORTED] else {}),
             **({'demoted': numbers[SINK_DEMOTED]} if numbers[SINK_DEMOTED] else {}),
             **({'not_due': numbers[SINK_NOT_DUE]} if numbers[SINK_NOT_DUE] else {})}
 
@@ -331,7 +332,8 @@ class Tally:
         for dag in self._dags:
             dags[dag.name] = {
                 'jobs': self.jobs[dag.index],
-                'ends': {OUTCOMES[e]: n for e, n in self.ends[dag.index].items()},
+                'ends': {OUTCOMES[e]: n for e, n in self.ends[dag.index].items()
+                         if n or e != ABORTED},
                 'sinks': {self.vertex_name(v): self._sink_result(v)
                           for v in self.sinks_of(dag)}}
         return {'deadline_missed': self.missed, 'first_miss': self._first_of_all(),

@@ -66,7 +66,7 @@ executions that are checked for one that may start.
 """
 
 REMEMBERED = 4096
-"""How many past items of a kind are remembered: aborted jobs, stamps of jobs, undeclared names."""
+"""How many past items of a kind are remembered: stamps of jobs, undeclared names."""
 
 LOG_EVERY_S = 10.0
 """The minimum time between two logged warnings of the same kind."""

@@ -74,7 +74,7 @@ class _Seen(NamedTuple):
     in_stops: int
 
 
-_REASONS = ('late', 'expired', 'aborted', 'failed', 'dropped', 'demoted')
+_REASONS = ('late', 'expired', 'failed', 'dropped', 'demoted')
 
 
 class DagWatch:

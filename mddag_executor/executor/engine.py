@@ -26,7 +26,7 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     core does not know of them.  It would choose the same.  As soon as there is anything else to
     choose from (a declared or long callback, a second thread), ``_core`` reports the running
     one and the waiting ones to the core.
-5.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped by an abort) are
+5.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped for newer ones) are
     counted, recorded and reported to the user (``verdicts``).
 """
 
@@ -356,11 +356,7 @@ class Engine:
         vertex, leg = target
         here = Origin(slot, dag, job, vertex)
         if self.open_release(here) is None:
-            if not self.verdicts.was_aborted(dag, job):
-                return False
-            entity.ready += 1
-            self.verdicts.dropped(entity, here, 'aborted', now)
-            return True
+            return False
         x = self.scheduler.execution(slot, vertex, leg)
         if state.x_state[x] != IDLE:
             return False  # a second message for the same vertex of the same job
@@ -802,12 +798,10 @@ class Engine:
             return
         for x in self.verdicts.add(decisions, now):
             work = self._work.pop(x, None)
-            if work is not None:  # dropped by the core: of an aborted job, or for a newer one
+            if work is not None:  # dropped by the core for a newer one
                 work.entity.waiting.pop(x, None)
                 work.x = -1
-                origin = work.origin or NO_ORIGIN
-                why = 'aborted' if self.verdicts.was_aborted(origin.dag, origin.job) else 'newer'
-                self.verdicts.dropped(work.entity, origin, why, now)
+                self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'newer', now)
 
     @property
     def is_judging(self) -> bool:

@@ -107,8 +107,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param graph: a declaration (path of a YAML file), a ``msg_graph.TaskSet``, or None.
     :param num_workers: threads of the pool; by default the declared number, else seven.
     :param policy: ``rad`` or another of ``mddag_executor.core.POLICIES``.
-    :param on_late: the treatment of late jobs of a DAG that does not declare it: ``continue``,
-        ``demote`` or ``abort``.
+    :param on_late: the treatment of late jobs of a DAG that does not declare it: ``continue``
+        or ``demote``.
     :param context: the context of the executor, or None for the default one.
     :param trace: path of an MCAP file to record to, or None. If the file exists, the constructor
         raises, unless ``overwrite`` is true.

@@ -43,7 +43,6 @@ class SinkCounts(RareCounts):
     overdue: int
     expired: int
     failed: int
-    aborted: int
     dropped: int
     response_ns: ResponseTimes | None
 
@@ -53,7 +52,6 @@ class JobEnds(TypedDict):
 
     completed: int
     late: int
-    aborted: int
     expired: int
     failed: int
     dropped: int
@@ -99,8 +97,8 @@ class CallbackCounts(TypedDict):
 
     ``ready`` counts what became ready: messages, requests, releases of timers. ``ran`` counts
     executions (``failed``: they raised an exception), ``dropped`` those that did not run (QoS
-    depth, destroyed, aborted, a newer one), ``lost`` messages that the middleware dropped before
-    the executor could take them, ``skipped`` releases of a timer that was too slow,
+    depth, destroyed, a newer one), ``lost`` messages that the middleware dropped before the
+    executor could take them, ``skipped`` releases of a timer that was too slow,
     ``unattributed`` messages of a declared callback whose job was not found. ``interpreter_share``
     is the fraction of its time in which it needs the interpreter, None: not known yet.
     ``incompatible_qos`` is the policy because of which a subscription gets nothing from a

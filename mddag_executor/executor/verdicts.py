@@ -11,7 +11,6 @@ from typing import Any, Protocol
 
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.state import (
-    ABORTED,
     Decision,
     DROP,
     EXPIRED,
@@ -26,13 +25,12 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.stops import LEAST_NS, Stops
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import Origin
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 2_000
-_RECORDED_ENDS = {ABORTED: 'abort', EXPIRED: 'expire', OUTDATED: 'outdate'}
+_RECORDED_ENDS = {EXPIRED: 'expire', OUTDATED: 'outdate'}
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class DeadlineMiss:
 
     ``kind`` is ``overdue`` if it had not completed at its deadline, which is reported at once.  It
     is ``late`` if the executor learnt of the completion first, at the time ``completed_ns`` (else
-    None).  A miss that is certain before the deadline is ``expired``, ``aborted`` or ``failed`` (a
+    None).  A miss that is certain before the deadline is ``expired`` or ``failed`` (a
     callback of the job raised) if the job can no longer complete, or ``dropped`` for a newer job
     (``keep: newest``).
     """
@@ -88,7 +86,6 @@ class Verdicts:
         self._on_miss = on_miss
         #: Called with DAG and release of each job that starts.
         self.on_release: Callable[[int, int], None] | None = None
-        self._aborted: dict[tuple[int, int], None] = {}
 
     def add(self, decisions: list[Decision], now: int) -> list[int]:
         """Count decisions of the core; return the executions that it dropped."""
@@ -110,17 +107,9 @@ class Verdicts:
         return dropped
 
     def _ended(self, dag: int, job: int, end: int, now: int) -> None:
-        if end == ABORTED:
-            self._aborted[(dag, job)] = None
-            if len(self._aborted) > REMEMBERED:
-                del self._aborted[next(iter(self._aborted))]
         name = _RECORDED_ENDS.get(end)
         if self.record is not None and name is not None:
             self.record(name, now, threading.get_native_id(), dag, job)
-
-    def was_aborted(self, dag: int, job: int) -> bool:
-        """Return whether a job was aborted (the last few thousand are remembered)."""
-        return (dag, job) in self._aborted
 
     def _missed(
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int, now: int,

@@ -141,7 +141,7 @@ def feasible(
     * judged by the ``horizon``: if the longest path to a sink is longer than its deadline, or if
       more has to be executed by deadlines within the duration than the workers can by then;
     * judged by ``completions``: if the longest path to a sink is longer than its deadline, and the
-      first job of the sink surely completes within the duration (or is aborted at its deadline).
+      first job of the sink surely completes within the duration.
       Jobs that never complete are not judged, so that an overload alone proves nothing.
 
     :param overhead_ns: of each dispatch
@@ -163,7 +163,7 @@ def feasible(
                 lengths[index] += lengths[list(vertex.predecessors)].max(axis=0)
             if vertex.deadline_ns is not None and vertex.deadline_ns <= duration_ns:
                 late = lengths[index] > vertex.deadline_ns
-                if not horizon and dag.on_late != 'abort':
+                if not horizon:
                     late &= lengths[index] + overheads + latest < duration_ns
                 possible &= ~late
             jobs = max(0, (duration_ns - offsets[index]) // dag.period_ns + 1)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import re
 from typing import NamedTuple
 
+from mddag_executor.core.tables import DEMOTE
 from mddag_executor.errors import InputError
 from mddag_executor.trace import TraceError, TraceReader
 from mddag_executor.trace.errors import renamed
@@ -17,6 +18,10 @@ from msg_graph import GraphError, loads, TaskSet
 TASK_SET = 'mddag:task_set'
 _RENAMED = re.compile(r'\bon_miss(?=[\'"]?\s*:)')
 """Older name of ``on_late``, written before version 2.0."""
+_GONE = re.compile(r"(\bon_late['\"]?\s*:\s*['\"]?)abort\b")
+"""A treatment of late jobs that version 2.0 had; rescheduled, such jobs are demoted."""
+_ABORT = 2
+"""Its number in the head."""
 
 
 class ReplayError(InputError):
@@ -53,7 +58,8 @@ def read_head(reader: TraceReader) -> Head | None:
             return None
         of_this = True
         if None not in event:       # None: another program wrote it, fields are missing
-            return Head(event[1], *event[4:])
+            head = Head(event[1], *event[4:])
+            return head._replace(on_late=DEMOTE) if head.on_late == _ABORT else head
     if of_this:
         raise no_run(reader)
     return None
@@ -71,7 +77,8 @@ def declared(head: Head, name: str) -> TaskSet:
             name, 'it was recorded without a declaration, so there are no jobs',
             'give the GRAPH that judges it (mddag graph from-trace drafts one)')
     try:
-        return loads(_RENAMED.sub('on_late', head.yaml), head.file or name)
+        return loads(
+            _GONE.sub(r'\1demote', _RENAMED.sub('on_late', head.yaml)), head.file or name)
     except GraphError as error:
         raise ReplayError(
             name, f'the declaration that it was recorded with is wrong ({error})',

@@ -9,11 +9,11 @@ The simulator and the rescheduler keep a log: which worker began, ended or preem
 and when.  With the load and the ends of jobs decided by the core this contains all data of a
 recording.  So every analysis works as on a recording and finds the same verdicts.
 
-At the same instant ends of executions come first, each with the job that it aborts, then early
-ends of jobs, then releases, then starts, then ends of executions that took no time.  A vertex is
-ready when the last message that it needs has arrived: at the end of the publishing execution,
-shifted by the delays of the load.  A preempted execution has several pieces, like a suspended
-coroutine.  A sync callback runs once for all of its legs.
+At the same instant ends of executions come first, then early ends of jobs, then releases, then
+starts, then ends of executions that took no time.  A vertex is ready when the last message that it
+needs has arrived: at the end of the publishing execution, shifted by the delays of the load.  A
+preempted execution has several pieces, like a suspended coroutine.  A sync callback runs once for
+all of its legs.
 """
 
 from __future__ import annotations
@@ -24,14 +24,12 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, Tables
 from mddag_executor.core.state import (
-    ABORTED,
     Decision,
     DROP,
     EXPIRED,
     JOB_END,
     OUTDATED,
     SINK_DEMOTED,
-    SINK_LATE,
 )
 from mddag_executor.recording import tables
 from mddag_executor.recording.entities import Entities
@@ -43,8 +41,8 @@ from mddag_executor.simulate.load import edge_numbers, FAILS
 from msg_graph import TaskSet
 import numpy as np
 
-_DROPS = -1, ABORTED, EXPIRED      # ends of jobs, in the order of the drop reasons
-_REASONS = {ABORTED: tables.ABORTED, EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
+_DROPS = -1, EXPIRED      # ends of jobs, in the order of the drop reasons
+_REASONS = {EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
 """Reasons, in terms of a recording, why jobs ended early."""
 
 
@@ -93,7 +91,7 @@ class ComputedRun(NamedTuple):
             task_set.file, Head(0, task_set.text, task_set.file, '', workers,
                                 DEFAULT_DEADLINE_NS, 0, False),
             task_set, task_set, who, same=False, releases=releases, executions=executions,
-            job_ends=job_ends, drops=found.drops(), drop_reasons=('newer', 'aborted', 'expired'),
+            job_ends=job_ends, drops=found.drops(), drop_reasons=('newer', 'expired'),
             demotions=found.demotions(),
             start=tables.earliest(releases['release'], executions['ready']),
             end=self.end, judged=self.judged, judged_until=self.end, workers_each=workers,
@@ -169,7 +167,6 @@ class _Tables:
         rank = self._ranks(pieces.ends[done])
         failed = self._fails(done)
         early = self._early_ends()
-        causes = self._causes(early, done[rank == 0])
         released = np.flatnonzero(
             (load.times < self._schedule.horizon) & (load.times <= self._schedule.end)
             & (load.dags < self._n_dags))
@@ -177,7 +174,7 @@ class _Tables:
         keys: list[tuple[Any, ...]] = [
             (pieces.end[done], rank, pieces.ends[done], 1),
             (pieces.end[done[failed]], rank[failed], pieces.ends[done[failed]], 0),
-            (early[4], np.where(causes < 0, 1, 0), causes, 2 + np.arange(len(causes))),
+            (early[3], 1, -1, np.arange(len(early[3]))),
             (load.times[released], 1, 0, np.arange(len(released)))]
         order = np.argsort(sort_by(*np.concatenate(
             [np.array(np.broadcast_arrays(*key)) for key in keys], axis=1))) + 1
@@ -206,37 +203,12 @@ class _Tables:
             load.cost_base[dag] + pieces.job[done] * load.cost_stride[dag] + local] == FAILS)
 
     def _early_ends(self) -> Ints:
-        """Return early ends of jobs: DAG, vertex that aborts it or -1, job, reason, time."""
-        kind, dag, vertex, job, how, time = self._decisions
+        """Return early ends of jobs: DAG, job, reason, time."""
+        kind, dag, _, job, how, time = self._decisions
         rows = np.flatnonzero(
             (kind == JOB_END) & np.isin(how, list(_REASONS)) & (dag < self._n_dags))
-        late = np.r_[np.flatnonzero(kind == SINK_LATE), -1]
-        at = late[np.searchsorted(late[:-1], rows) - 1]     # the last one before
-        same = (at >= 0) & (dag[at] == dag[rows]) & (job[at] == job[rows]) & (
-            time[at] == time[rows])
         reasons = np.array([_REASONS[each] for each in how[rows].tolist()], dtype=np.int64)
-        return np.array([
-            dag[rows], np.where(same, vertex[at], -1), job[rows], reasons, time[rows]])
-
-    def _causes(self, early: Ints, done: Ints) -> Ints:
-        """
-        Return by early end the row of the log that aborts the job, or -1.
-
-        -1 also if an earlier end at the same time comes after all completions.
-
-        :param done: the completions before all starts at their time.
-        """
-        pieces = self._pieces
-        done = done[np.isin(pieces.end[done], early[4][early[3] == tables.ABORTED])]
-        row_of = dict(zip(zip(*(each[done].tolist() for each in (
-            pieces.vertex, pieces.job, pieces.end))), pieces.ends[done].tolist()))
-        found, pending = [], -1
-        for _, vertex, job, reason, time in early.T.tolist():
-            row = row_of.get((vertex, job, time), -1) if reason == tables.ABORTED else -1
-            if row < 0:
-                pending = time
-            found.append(-1 if pending == time else row)
-        return np.array(found, dtype=np.int64)
+        return np.array([dag[rows], job[rows], reasons, time[rows]])
 
     def _releases(self, rows: Ints, order: Ints) -> tables.Table:
         load = self._load
@@ -248,10 +220,10 @@ class _Tables:
 
     def _job_ends(self, failed: Ints, failures: Ints, early: Ints, order: Ints) -> tables.Table:
         pieces = self._pieces
-        early[1] = UNKNOWN
-        dag, vertex, job, reason, time = np.concatenate([np.array(np.broadcast_arrays(
-            pieces.dag[failed], pieces.vertex[failed], pieces.job[failed], tables.FAILED,
-            pieces.end[failed])), early], axis=1)
+        dag, job, reason, time = np.concatenate([np.array(np.broadcast_arrays(
+            pieces.dag[failed], pieces.job[failed], tables.FAILED, pieces.end[failed])), early],
+            axis=1)
+        vertex = np.r_[pieces.vertex[failed], np.full(len(early[0]), UNKNOWN)]
         found = tables.rows(
             tables.JOB_ENDS, len(dag), dag=dag, vertex=vertex, job=self._numbers(dag, job),
             time=time, reason=reason, order=np.r_[failures, order])

@@ -32,7 +32,7 @@ from msg_graph import TaskSet
 
 PROCESS = 1
 _MOST = 2 ** 31 - 1
-_ENDS = {tables.ABORTED: 'abort', tables.EXPIRED: 'expire', tables.OUTDATED: 'outdate'}
+_ENDS = {tables.EXPIRED: 'expire', tables.OUTDATED: 'outdate'}
 _Entry = tuple[tuple[int, int, int], str, int, int, tuple[Any, ...]]
 """Position in the order, name, time, thread, fields."""
 

@@ -90,7 +90,7 @@ def run(
     Run the core over a load, with an empty state, deliveries and machine; return the end, ns.
 
     Decisions are in ``s.decisions``.  With ``Orders.stop_at_first_miss`` the run ends with the
-    instant at which the first miss is known: a late completion, an expiry or an abort.
+    instant at which the first miss is known: a late completion, or an early end of a job.
 
     :param busy: receives by worker its busy time, ns; ``log``: the log of the workers, if wanted.
     :param progress: receives the virtual time at each event.

@@ -45,7 +45,7 @@ COMMANDS = {
     'simulate': 'simulate graph.yaml --duration 200ms',
     'simulate_options': '; '.join(f'simulate graph.yaml --duration 200ms {how}' for how in (
         '--execution-times times.json', '--judge completions', '--preemptive',
-        '--on-late abort', '--stop-at-first-miss --report out.html')),
+        '--on-late demote', '--stop-at-first-miss --report out.html')),
     'simulate_json': 'simulate graph.yaml --duration 200ms --policy fifo --json -',
     'evaluate': 'evaluate graph.yaml --runs 30 --policies rad,fifo --jobs 1 --duration 200ms',
     'evaluate_json': 'evaluate graph.yaml --runs 30 --policies rad --jobs 1 --json -',

@@ -46,7 +46,7 @@ def test_what_is_asked_for_is_done(call, graph):
         assert sinks(call(*simulate, *option).result)['/filter:near'][1] == late
 
 
-@pytest.mark.parametrize('on_late', ['continue', 'demote', 'abort'])
+@pytest.mark.parametrize('on_late', ['continue', 'demote'])
 def test_late_jobs_are_rescheduled_as_they_were_treated(call, graph, on_late):
     simulated = call('simulate', graph, '--workers', 1, '--duration', '200ms', '--on-late',
                      on_late, '--trace', 'run.mcap', '--json', '-').result

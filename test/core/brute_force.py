@@ -15,8 +15,6 @@ Its reading of the documents:
   happened. What is preempted queues up again, behind all that is there.
 * A DAG with ``max_active_jobs`` open jobs loses the oldest when one more is released: it expires.
   What it has ready or running goes on, without consequences.
-* ``abort`` takes effect at a late completion, and when what is next to be handed out belongs to a
-  job that has an unfinished sink past its deadline. What has never run of the job vanishes.
 * ``demote`` (``rad``, ``gedf``, ``llf``): an execution that would start next, and cannot make any
   deadline that it leads to any more, if every vertex on the longest way takes its mean time, goes
   from then on as if its job were released ten relative deadlines later. As long as only some
@@ -132,7 +130,7 @@ class BruteForce:
         self.misses = []
         self.counts = {
             (dag.index, sink): dict.fromkeys(
-                ('completed', 'late', 'overdue', 'expired', 'failed', 'aborted', 'dropped'), 0)
+                ('completed', 'late', 'overdue', 'expired', 'failed', 'dropped'), 0)
             for dag in self.dags for sink in dag.sinks}
         self.responses = {key: [] for key in self.counts}
         # by DAG, vertex and sink that it leads to: the latest start, ns after the release
@@ -368,8 +366,6 @@ class BruteForce:
         for sink in self._open_sinks(job):
             self.counts[job.dag.index, sink][outcome] += 1
             self._miss(job, sink, None)
-        if outcome == 'aborted':
-            self.waiting = [e for e in self.waiting if e.job is not job or e.has_run]
 
     def _miss(self, job, sink, completed):
         self.misses.append({
@@ -423,8 +419,6 @@ class BruteForce:
             self._miss(job, sink, self.now)
         if not self._open_sinks(job):
             job.outcome = 'late' if job.late else 'completed'
-        elif late and job.dag.on_late == 'abort':
-            self._give_up(job, 'aborted')
 
     # --- workers ---------------------------------------------------------------------------------
 
@@ -449,11 +443,6 @@ class BruteForce:
         if best is None:
             return False
         if self._demote(best):
-            return True
-        job = best.job
-        if job.outcome is None and job.dag.on_late == 'abort' and any(
-                self._deadline(job, sink) < self.now for sink in self._open_sinks(job)):
-            self._give_up(job, 'aborted')
             return True
         if None in self.running:
             self._start(best, self.running.index(None))
@@ -511,7 +500,7 @@ class BruteForce:
         result = {}
         for dag in self.dags:
             outcomes = [job.outcome for job in self.jobs if job.dag is dag]
-            ends = ('completed', 'late', 'aborted', 'expired', 'failed', 'dropped')
+            ends = ('completed', 'late', 'expired', 'failed', 'dropped')
             result[dag.name] = {
                 'jobs': len(outcomes), 'ends': {end: outcomes.count(end) for end in ends},
                 'sinks': {dag.vertices[sink].name: self._sink(dag, sink) for sink in dag.sinks}}

@@ -120,7 +120,7 @@ def task_sets(
     Draw a task set: one to some DAGs with AND, OR, unequal deadlines, shared callbacks.
 
     :param groups: some callbacks are in mutually exclusive groups, also across DAGs.
-    :param bounds: some DAGs abort or demote late jobs or bound their open jobs.
+    :param bounds: some DAGs demote late jobs or bound their open jobs.
     :param newest: some sources and sinks keep only the newest.
     :param optional: some topics are published only sometimes, some sinks have no deadline.
     :param importance: sinks have an importance, and some tolerate misses.
@@ -139,8 +139,7 @@ def task_sets(
                 callback['timer'] = _ticks(draw, 3, 15)
                 callback['dag'] = f'dag{dag}'
                 if bounds:
-                    callback['on_late'] = draw(
-                        st.sampled_from(['continue', 'demote', 'demote', 'abort']))
+                    callback['on_late'] = draw(st.sampled_from(['continue', 'demote', 'demote']))
                     if draw(st.booleans()):
                         callback['max_active_jobs'] = draw(st.integers(1, 3))
             mine.append(callback)

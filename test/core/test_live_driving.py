@@ -19,7 +19,6 @@ from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.overload import _change_key
 from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
-    ABORTED,
     COMPLETED,
     DROP,
     EXPIRED,
@@ -28,7 +27,6 @@ from mddag_executor.core.state import (
     JOB_END,
     LATE,
     OPEN,
-    SINK_ABORTED,
     SINK_COMPLETED,
     SINK_DEMOTED,
     SINK_DROPPED,
@@ -319,7 +317,7 @@ class LiveDriver(RuleBasedStateMachine):
         assert self.over() == []
 
     @precondition(OPEN_JOBS)
-    @rule(data=st.data(), end=st.sampled_from([ABORTED, EXPIRED]))
+    @rule(data=st.data(), end=st.sampled_from([EXPIRED, FAILED]))
     def end_job(self, data, end):
         job = data.draw(st.sampled_from(self.open_jobs()))
         self.scheduler.give_up(job.slot, end, self.now)
@@ -373,7 +371,7 @@ class LiveDriver(RuleBasedStateMachine):
                 assert sink not in self.sinks, 'two verdicts'
                 self.sinks[sink] = kind
                 assert kind in (
-                    *SINK_COMPLETED, SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_DROPPED,
+                    *SINK_COMPLETED, SINK_EXPIRED, SINK_FAILED, SINK_DROPPED,
                     SINK_NOT_DUE)
 
     def dropped(self, decision):

@@ -32,7 +32,7 @@ def compare(case, horizon, judge='horizon', stop=False, last_release=None):
 @examples(100)
 @given(st.data(), st.integers(5, 50), st.sampled_from(['horizon', 'completions']), st.booleans())
 def test_everything_at_once(policy, data, horizon, judge, stop):
-    """Groups, bounds, aborts and overheads, or none of them, as in the paper."""
+    """Groups, bounds and overheads, or none of them, as in the paper."""
     with_groups, with_bounds, overheads = (data.draw(st.booleans()) for _ in range(3))
     compare(data.draw(cases((policy,), groups=with_groups, bounds=with_bounds,
                             newest=with_bounds, overheads=overheads)), horizon, judge, stop)

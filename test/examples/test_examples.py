@@ -59,19 +59,20 @@ def test_sensor_fusion(tmp_path):
 
 
 def test_overload():
-    """A short queue completes more than a long one, whose jobs are aborted before they run."""
+    """A short queue has more results in time than a long one, whose images wait too long."""
     ends = {}
     for size, block in re.findall(r'queue of (\d+):\n(.*\n.*\n.*)', run('overload')):
         counts = {name: {end: int(count) for count, end in re.findall(r'(\d+) (\w+)', line)}
                   for name, line in re.findall(r'^  (control|perception): (.*)$', block, re.M)}
         for dag in counts.values():
             assert 0 <= 2 * dag['jobs'] - sum(dag.values()) <= 6  # so many are open at the end
-        assert counts['control']['aborted'] == 0
+        # a busy machine may skip a release
+        assert 10 * counts['control']['expired'] <= counts['control']['jobs']
         ends[size] = counts['perception']
-        # Each is reported as overdue, before it is aborted.
+        # Each is reported as overdue, before it expires.
         reported = re.findall(r'(\d+) perception \w+', block.split('misses:')[1])
-        assert sum(map(int, reported)) >= ends[size]['aborted']
-    assert ends['10']['aborted'] > ends['1']['aborted']
+        assert sum(map(int, reported)) >= ends[size]['expired']
+    assert ends['10']['expired'] + ends['10']['late'] > ends['1']['expired'] + ends['1']['late']
     assert ends['10']['completed'] < ends['1']['completed']
 
 

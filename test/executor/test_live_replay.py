@@ -31,7 +31,7 @@ GRAPH = graph(
         name: rectify, subscription: /info, publishes: [/flat]
         name: watch, subscription: /info, deadline: 200ms""",
     fuse='name: join, sync: [/boxes, /flat], deadline: 12ms',
-    imu='name: tick, timer: 10ms, publishes: [/twist], on_late: abort',
+    imu='name: tick, timer: 10ms, publishes: [/twist], keep: newest',
     filter="""
         name: use, subscription: /twist, publishes: [/odometry]
         name: show, subscription: /odometry, deadline: 6ms""")
@@ -151,7 +151,7 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
     assert sinks['/fuse:join']['late'] > 3
     assert sinks['/right:watch']['completed'] > 20
     imu = live['dags']['/imu']
-    assert sinks['/filter:show']['aborted'] == imu['ends']['aborted'] > 3
+    assert imu['ends']['late'] + imu['ends']['dropped'] > 3
     assert sum(live['dropped'].values()) > 0
     for breakdown, response in breakdowns:
         worst = breakdown['worst']
@@ -167,19 +167,19 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
         assert dag['jobs'] == live['dags'][name]['jobs']
 
 
-def test_what_is_late_when_it_arrives_is_aborted_after_its_release(
+def test_what_is_late_when_it_arrives_is_late_after_its_release(
         make_executor, make_node, tmp_path):
     text = graph(
         late='name: cb, subscription: /old, period: 10ms, release_from: header_stamp, '
-             'on_late: abort, deadline: 5ms')
+             'deadline: 5ms')
     path, node = tmp_path / 'late.mcap', make_node('late')
     publisher = node.create_publisher(Header, '/old', 10)
     node.create_subscription(Header, '/old', print, 10)
     executor = make_executor(
         loads(text, 'g.yaml'), num_workers=1, trace=str(path), nodes=[node])
 
-    def aborted(result):
-        return result['dags']['/late']['sinks']['/late:cb']['aborted']
+    def late(result):
+        return result['dags']['/late']['sinks']['/late:cb']['late']
 
     with Spinning(executor):
         for _ in range(20):
@@ -188,7 +188,7 @@ def test_what_is_late_when_it_arrives_is_aborted_after_its_release(
             time.sleep(0.01)
     outcome = replay(path)
     assert outcome.warnings == []
-    assert 10 < aborted(outcome.result()) == aborted(executor.statistics())
+    assert 10 < late(outcome.result()) == late(executor.statistics())
 
 
 def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):

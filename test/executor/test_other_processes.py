@@ -106,7 +106,7 @@ def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_execut
     for executor, expired in ((up, skipped), (down, 0)):
         assert executor.statistics()['never_ran'] == []
         assert ends(executor) == {
-            'completed': n, 'late': 0, 'aborted': 0, 'expired': expired, 'failed': 0, 'dropped': 0}
+            'completed': n, 'late': 0, 'expired': expired, 'failed': 0, 'dropped': 0}
     assert up.statistics()['dags']['chain']['sinks'] == {}
     sink = down.statistics()['dags']['chain']['sinks']['/last:sink']
     assert (sink['completed'], sink['late']) == (n, 0)

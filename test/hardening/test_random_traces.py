@@ -39,7 +39,7 @@ def runs(tmp_path_factory):
     """Give the events of a small run and the first ones of a recorded run, entities and all."""
     folder = tmp_path_factory.mktemp('run')
     (folder / 'graph.yaml').write_text(
-        SMALL.replace('timer: 10ms', 'timer: 10ms, on_late: abort') + PATHS)
+        SMALL.replace('timer: 10ms', 'timer: 10ms, on_late: demote') + PATHS)
     assert program.main(('simulate', str(folder / 'graph.yaml'), '--duration', '60ms', '--workers',
                          '1', '--trace', str(folder / 'run.mcap'))) == 0
     return [events_of(folder / 'run.mcap', 10_000), events_of(BAG, 150)]

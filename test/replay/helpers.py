@@ -18,7 +18,6 @@ import random
 from hypothesis import strategies as st
 from mddag_executor.core import legs_of, Scheduler, Tables, Tally
 from mddag_executor.core.state import (
-    ABORTED,
     DROP,
     EXPIRED,
     FAILED,
@@ -92,9 +91,8 @@ def declarations(draw):
             heard = ', '.join(f'/d{d}t{p}' for p in before[i])
             start = f'sync: [{heard}]' if len(before[i]) > 1 else f'subscription: {heard}'
             if i == 0:
-                start = f'timer: 10ms, dag: dag{d}' + ''.join(
-                    key for key in (', on_late: abort', ', max_active_jobs: 2')
-                    if draw(st.booleans()))
+                start = f'timer: 10ms, dag: dag{d}' + (
+                    ', max_active_jobs: 2' if draw(st.booleans()) else '')
             end = f'deadline: {draw(st.sampled_from([*range(3, 31), None]))}ms'.replace(
                 'Nonems', 'none')
             if topics:
@@ -139,9 +137,12 @@ def ns(ms):
 class Written:
     """A trace of this executor written by hand; times are ms since `START_TIME`."""
 
-    def __init__(self, path, declaration, workers=1, policy='rad', cpus=0, name='g.yaml'):
+    def __init__(
+        self, path, declaration, workers=1, policy='rad', cpus=0, name='g.yaml', on_late=0
+    ):
         self.path, self.file = path, TraceFile(path, overwrite=True)
-        self.add('task_set', 0, declaration, name, policy, workers, 100 * MS, 64, False, cpus)
+        self.add('task_set', 0, declaration, name, policy, workers, 100 * MS, 64, False, cpus,
+                 on_late)
 
     def add(self, event, at, *fields, thread=1):
         self.file.add(event, ns(at), 1, thread, *fields)
@@ -231,7 +232,7 @@ class VirtualRun:
         self.responses = []
         self._targets = legs_to(self.task_set, self.tables)
         self._queue, self._order = [], count()
-        self._waiting, self._aborted = {}, set()
+        self._waiting = {}
         self._published = defaultdict(set)
         self._optional = {topic: 9000 + place for place, topic in enumerate(sorted(
             {topic for each in self.task_set.callbacks for topic in each.may_publish}))}
@@ -315,10 +316,7 @@ class VirtualRun:
             state = self.scheduler.state
             if (state.job_dag[slot] != dag or state.job_index[slot] != job
                     or state.job_state[slot] != OPEN):
-                if (dag, job) in self._aborted:
-                    self._record_drop(vertex, dag, job, 'aborted', now)
-                else:
-                    self._undeclared(now)
+                self._undeclared(now)
             elif state.x_state[self.scheduler.execution(slot, vertex, leg)] != IDLE:
                 self._undeclared(now)
             else:
@@ -409,16 +407,10 @@ class VirtualRun:
         decisions = self.scheduler.decisions()
         self.tally.add(decisions)
         for kind, dag, vertex, job, deadline, time in decisions:
-            if kind == DROP:
-                work = self._waiting.pop(deadline, None)
-                if work is not None:
-                    self._record_drop(work.vertex, work.dag, work.job, 'aborted', now)
-            elif kind == JOB_END:
-                if deadline == ABORTED:
-                    self._aborted.add((dag, job))
-                if deadline in (ABORTED, EXPIRED):
-                    self.record('abort' if deadline == ABORTED else 'expire', now, 2, dag, job)
-            elif kind != SINK_NOT_DUE:
+            if kind == JOB_END:
+                if deadline == EXPIRED:
+                    self.record('expire', now, 2, dag, job)
+            elif kind not in (DROP, SINK_NOT_DUE):
                 if kind in SINK_COMPLETED:
                     self.responses.append(time - deadline + self.tables.sink_deadline[vertex])
                 if kind != SINK_IN_TIME:

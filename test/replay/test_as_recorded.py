@@ -349,3 +349,33 @@ def test_a_recorded_declaration_may_have_the_key_of_version_1(key):
         return declared(Head(0, text, 'g.yaml', 'rad', 7, 100 * MS, 64, False), 'run.mcap').dags
 
     assert read(key) == read('on_late:')
+
+
+@pytest.mark.parametrize(('how', 'declaration'), [
+    (2, ONE), (0, ONE.replace('deadline', 'on_late: abort, deadline'))])
+def test_jobs_that_version_2_aborted_are_counted_and_rescheduled_as_demoted(
+        tmp_path, how, declaration, call):
+    """Job 0 is late, and job 1 is aborted behind it."""
+    trace = Written(tmp_path / 'a.mcap', declaration, on_late=how)
+    for job in range(3):
+        trace.release(0, job, 10 * job)
+    trace.run(0, 0, 0, 0, 20)
+    trace.add('deadline', 20, 0, 0, 0, ns(9), ns(20))
+    trace.add('deadline', 20, 0, 0, 1, ns(19), -1)
+    trace.add('abort', 20, 0, 1)
+    trace.add('drop', 20, 1000, 0, 0, 1, 'aborted')
+    trace.run(0, 0, 2, 20, 22)
+    path = trace.end(40)
+    recorded = replay(path)
+    assert recorded.warnings == []
+    dag = recorded.result()['dags']['/n']
+    sink = dag['sinks']['/n:a']
+    assert (sink['completed'], sink['late'], sink['aborted']) == (2, 1, 1)
+    assert dag['ends']['aborted'] == 1
+    assert '1 aborted' in call('replay', path).stdout
+    result = reschedule(path).result()
+    assert 'aborted' not in result['dags']['/n']['sinks']['/n:a']
+    if how:
+        assert result['on_late'] == 'demote'
+    else:
+        assert reschedule(path).task_set.dags[0].on_late == 'demote'

@@ -97,7 +97,7 @@ def counts(result):
             found[f'{sink_name} completed'] = sink['completed']
             found[f'{sink_name} late'] = sink['late'] - sink['overdue']
             found[f'{sink_name} expired'] = sink['expired']
-            found[f'{sink_name} missed'] = sink['late'] + sink['expired'] + sink['aborted']
+            found[f'{sink_name} missed'] = sink['late'] + sink['expired']
     for key, use in result['callbacks'].items():
         found[f'{key} executions'] = use['executions']
         found[f'{key} busy'] = use['busy_ns']

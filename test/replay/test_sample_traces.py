@@ -58,9 +58,8 @@ def files(tmp_path, monkeypatch):
     Path('demo.mcap').symlink_to(DEMO)
     Path('four.yaml').write_text(IMPORTED)
     four_jobs(Path('four.mcap'))
-    abort = SMALL.replace('timer: 20ms,', 'timer: 20ms, on_late: abort,') + PATHS
     for seed, workers, policy in ((1, 2, 'fifo'), (7, 4, 'fifo')):
-        VirtualRun(Path(f'v{seed}.mcap'), loads(abort, 'g.yaml'), seed, workers=workers,
+        VirtualRun(Path(f'v{seed}.mcap'), loads(SMALL + PATHS, 'g.yaml'), seed, workers=workers,
                    policy=policy, duration=(400 + 100 * seed) * MS, longest=(3 + 2 * seed) * MS,
                    chances=Chances(undeclared=1))
     Path('other0.yaml').write_text(SMALL.replace('deadline: 18ms', 'deadline: 9ms') + PATHS)

@@ -56,7 +56,7 @@ def compare(case, horizon, judge='horizon', stop=False):
 @given(EVERY_RULE, st.integers(5, 60), st.sampled_from(['horizon', 'completions']),
        st.booleans())
 def test_everything_at_once(case, horizon, judge, stop):
-    """Groups, bounds, aborts and overheads too."""
+    """Groups, bounds and overheads too."""
     compare(case, horizon, judge, stop)
 
 
