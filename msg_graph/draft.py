@@ -62,6 +62,9 @@ class DraftCallback:
     :ivar interval_ns: measured mean time between two of its executions.
     :ivar times: its measured execution time, and the number of measured executions.
     :ivar also: other declared keys, with their values.
+    :ivar sometimes: topics of ``publishes`` that it publishes only sometimes: in how many of how
+        many executions, None if they are declared.
+    :ivar judged: of a sink: False if it has no deadline.
     """
 
     node: str
@@ -80,6 +83,8 @@ class DraftCallback:
     interval_ns: int | None = None
     times: tuple[ExecutionTime, int] | None = None
     also: dict[str, str] = field(default_factory=dict)
+    sometimes: dict[str, tuple[int, int] | None] = field(default_factory=dict)
+    judged: bool = True
 
     @property
     def key(self) -> str:
@@ -268,8 +273,9 @@ class _Writer:
                          f'which callback publishes {", ".join(callback.maybe)}?')
             if callback.publishes:
                 yield '# (instead of the next line)'
-        if callback.publishes:
-            yield f'publishes: {_listed(callback.publishes)}'
+        if always := [t for t in callback.publishes if t not in callback.sometimes]:
+            yield f'publishes: {_listed(always)}'
+        yield from self._sometimes(callback)
         if callback.reads:
             yield f'reads: {_listed(map(plain_scalar, callback.reads))}'
         if self._started.keys().isdisjoint(callback.publishes):
@@ -277,6 +283,15 @@ class _Writer:
         yield from (f'{key}: {value}' for key, value in callback.also.items())
         if callback.times is not None:
             yield from _execution_time(*callback.times)
+
+    @staticmethod
+    def _sometimes(callback: DraftCallback) -> Iterator[str]:
+        """Yield the topics that a callback publishes only in some executions."""
+        if callback.sometimes:
+            seen = [f'{topic} in {counts[0]} of {counts[1]} executions'
+                    for topic, counts in callback.sometimes.items() if counts is not None]
+            yield (f'may_publish: {_listed(callback.sometimes)}'
+                   + (f'  # published {", ".join(seen)}' if seen else ''))
 
     def _period(self, callback: DraftCallback) -> Iterator[str]:
         """Yield the period of a subscription or service that is a source."""
@@ -303,6 +318,8 @@ class _Writer:
         return _blank(entry, f'{what}; proposed: {why}')
 
     def _deadline(self, callback: DraftCallback) -> str:
+        if not callback.judged:
+            return 'deadline: none'
         if callback.deadline_ns is not None and not callback.maybe:
             return f'deadline: {exact_duration(callback.deadline_ns)}'
         what = 'if it is a sink' if callback.maybe else 'a sink'

@@ -43,6 +43,10 @@ from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
 import numpy as np
 
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
+LEAST_SILENT, LEAST_SILENT_SHARE = 2, 0.02
+"""A callback publishes only sometimes if more executions, and a larger share, were silent."""
+ONCE_PERIODS = 3
+"""A timer fires once if it was silent for so many periods after its only execution."""
 
 
 class Runs(NamedTuple):
@@ -52,12 +56,14 @@ class Runs(NamedTuple):
     :ivar starts: of each, ns; ``times``: how long each took, all pieces together.
     :ivar whole: which of them completed a vertex.
     :ivar topics: what they published on, in the order of time.
+    :ivar published: by topic, in how many executions it was published.
     """
 
     starts: Ints
     times: Ints
     whole: Mask
     topics: list[str]
+    published: dict[str, int]
 
 
 class System:
@@ -84,6 +90,7 @@ class System:
         self.warnings = list(reader.warnings)
         self._process_names = recording.process_names
         self._who = recording.who
+        self._end = recording.end
         self._entities = [entity for entity in sorted(
             self._who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
         if not self._entities:
@@ -114,7 +121,11 @@ class System:
         for callback, number in different.T[np.argsort(first)].tolist():
             known = publishers.get(number)
             if known is not None:
-                self._runs[callback].topics.append(known.topic)
+                runs = self._runs[callback]
+                runs.topics.append(known.topic)
+                mine = (pairs[0] == callback) & (pairs[1] == number)
+                runs.published[known.topic] = runs.published.get(known.topic, 0) + len(
+                    np.unique(sent['execution'][mine]))
                 if known.node is not None:
                     self._publishers[known.node.name][known.topic] = True
 
@@ -226,6 +237,14 @@ class System:
             if t not in callback.publishes and not is_background(t, callback.node)
             and TOPIC.fits(t))
         callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
+        if callback.kind != 'sync':     # each of its messages runs it, and one of them publishes
+            silent = {topic: count - n for topic, n in runs.published.items()}
+            callback.sometimes.update({
+                topic: (runs.published[topic], count) for topic in callback.publishes
+                if silent.get(topic, 0) > max(LEAST_SILENT, LEAST_SILENT_SHARE * count)})
+        if callback.kind == 'timer' and count == 1 and (
+                self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
+            callback.also['once'] = 'true'
         if callback.kind == 'sync':
             legs = [self._runs[number] for number, declared in self._declared.items()
                     if declared.key == callback.key]
@@ -263,7 +282,8 @@ def _runs_of(recording: Recording, which: Ints) -> Runs:
     table = table[sort_by(*(table[name] for name in ('vertex', 'job', 'ready', 'start')))]
     first = np.flatnonzero(table['piece'] == 0)
     last = np.append(first, len(table))[1:] - 1
-    return Runs(table['start'][first], table['busy'][last], table['completes'][last] == VERTEX, [])
+    return Runs(table['start'][first], table['busy'][last], table['completes'][last] == VERTEX,
+                [], {})
 
 
 def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:
@@ -292,8 +312,12 @@ def _from_declared(declared: Declared) -> DraftCallback:
         ('importance', declared.importance, 'normal'),
         ('tolerate', declared.tolerate, None),
         ('max_active_jobs', declared.max_active_jobs, None),
-        ('holds_interpreter', declared.holds_interpreter, None)) if value != usual}
+        ('holds_interpreter', declared.holds_interpreter, None),
+        ('once', declared.once, False), ('sporadic', declared.sporadic, False),
+        ) if value != usual}
     return DraftCallback(
-        declared.node, declared.name, declared.kind, starts, declared.period_ns, [], [],
+        declared.node, declared.name, declared.kind, starts, declared.period_ns,
+        list(declared.may_publish), [],
         list(declared.reads), declared.group, declared.dag, declared.deadline_ns,
-        declared.release_from, also=also)
+        declared.release_from, also=also, judged=declared.judged,
+        sometimes=dict.fromkeys(declared.may_publish))

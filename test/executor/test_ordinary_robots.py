@@ -6,7 +6,10 @@ import time
 
 from mddag_executor.executor import current_job
 from mddag_executor.replay import replay, reschedule
+from mddag_executor.replay.drafting import System
 from msg_graph import loads
+from msg_graph.draft import declaration_of
+import pytest
 
 from .conftest import is_idle, Spinning, wait_for
 from .declared import Declared, graph
@@ -70,6 +73,37 @@ def test_results_that_nothing_was_published_for_are_not_due(make_executor, make_
     recorded = replay(path).result()
     assert verdicts(recorded) == live
     assert verdicts(reschedule(path, workers=1).result()) == live
+
+
+PLAIN = ROBOT.replace(
+    'publishes: [/seen], may_publish: [/alarm]', 'publishes: [/seen, /alarm]').replace(
+    'once: true, ', '')
+
+
+@pytest.mark.parametrize('text', [ROBOT, PLAIN], ids=['declared so', 'declared plainly'])
+def test_the_draft_of_a_recording_knows_what_is_published_sometimes(
+        make_executor, make_node, tmp_path, text):
+    """Its verdict on the same recording has no miss, and keys that were declared stay."""
+    path = tmp_path / 'run.mcap'
+    robot = Declared(make_node, ROBOT, {
+        'detect': detect, 'start': lambda: robot.timers[1].cancel()})
+    executor = make_executor(loads(text), num_workers=3, trace=str(path))
+    with Spinning(executor):
+        robot.start(executor)
+        assert wait_for(lambda: len(robot.ran['detect']) >= 30)
+        robot.cancel()
+        assert wait_for(lambda: is_idle(executor))
+    executor.shutdown()
+    drafted = loads(declaration_of(System(path).draft(), accepted=True))
+    found = {callback.name: callback for callback in drafted.callbacks}
+    assert found['detect'].publishes == ('/seen', '/alarm')
+    assert found['detect'].may_publish == ('/alarm',)
+    assert (found['start'].once, found['grab'].once) == (True, False)
+    assert not found['store'].judged
+    results = verdicts(replay(path, drafted).result())
+    assert results['/brake:stop'][1] > 5
+    # a release may have been skipped on a busy machine
+    assert results['/brake:stop'][2:] == results['/fuse:fuse'][2:]
 
 
 LATE = graph(
