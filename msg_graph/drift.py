@@ -128,19 +128,19 @@ def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
 
 def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
     """Return the differences by rules 2, 3 and 4, by callback."""
-    dags = dags_of(task_set)
+    dags, certain = dags_of(task_set), _certain(task_set)
     suspects = {}
     for callback in task_set.callbacks:
         of_callback = dags.get(callback.key, [])
         if observed.nodes is not None and may_run_elsewhere(
                 callback, of_callback, observed.nodes, task_set):
             continue
-        why = _never_ran(callback, of_callback, observed)
+        why = _never_ran(callback, of_callback, observed) if callback.key in certain else None
         if why is None:
             if callback.period_ns is not None:
                 why = _source_rate(callback, callback.period_ns, observed)
             elif callback.kind == 'subscription':
-                why = _message_rate(callback, of_callback, observed)
+                why = _message_rate(callback, of_callback, observed, callback.key in certain)
         if why is not None:
             suspects[callback.key] = why
     return suspects
@@ -176,8 +176,6 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
     if observed.duration_ns < 2 * slowest + latest:
         return None
     due = _due_by_runs(callback, dags, observed)
-    if _may_never_start(callback, dags):
-        return None
     if topic is None and (observed.got.get(callback.key, 0) or due is not None and due < 2):
         return None     # the callbacks before it, or its own executions, were late or dropped
     text = (f'{callback.key} never {"ran" if topic is None else f"got a message of {topic}"} in '
@@ -212,37 +210,40 @@ def _due_by_runs(callback: Callback, dags: list[Dag], observed: Observed) -> int
     return sum(observed.ran[key] // max(1, len(legs_of(*each))) for key, each in before.items())
 
 
-def _message_rate(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:
+def _message_rate(
+    callback: Callback, dags: list[Dag], observed: Observed, is_certain: bool
+) -> Drift | None:
     expected = _due_by_runs(callback, dags, observed)
     got = observed.got.get(callback.key, 0)
     # The last release of each DAG may still be in progress.
     if expected is None or expected < LEAST or (
             abs(got - expected) <= TOLERANCE * expected + len(dags)) or (
-            got < expected and _may_never_start(callback, dags)):
+            got < expected and not is_certain):
         return None
     return Drift('rate', callback.key, None, expected, got,
                  printable(f'{callback.key} got {got} messages, and by the declaration '
                            f'{expected} were due'))
 
 
-def _may_never_start(callback: Callback, dags: Sequence[Dag]) -> bool:
+def _certain(task_set: TaskSet) -> set[str]:
     """
-    Return whether a callback need not run by its declaration.
+    Return the callbacks that must run by their declaration.
 
-    That is the case if each path to it has a sporadic source or a topic that is published
-    sometimes.
+    The others have a sporadic source, or a topic that is published sometimes, on each path to
+    them.
     """
-    for dag in dags:
+    found: set[str] = set()
+    for dag in task_set.dags:
         certain = [False] * len(dag.vertices)
         certain[dag.source] = not dag.sporadic
         for index in topological_order(dag):
             vertex = dag.vertices[index]
-            if certain[index] and vertex.callback.key == callback.key:
-                return False
+            if certain[index]:
+                found.add(vertex.callback.key)
             maybe = {after for after, _ in optional_edges(vertex, dag.vertices)}
             for after in vertex.successors:
                 certain[after] |= certain[index] and after not in maybe
-    return bool(dags)
+    return found
 
 
 def _first(task_set: TaskSet, suspects: Mapping[str, Drift]) -> list[str]:

@@ -26,7 +26,7 @@ sequence number, and job.  Both processes have the same system clock.
     window and sequence number.
 5.  *Announcements come from outside.*  One that cannot be true (an unknown vertex or topic, a
     release in the future or long ago) is ignored.  They are handled before all callbacks, so they
-    get a twentieth of a core at most; those beyond that are ignored, too, with a warning.
+    get a twentieth of a core at most; those beyond that are ignored as well, with a warning.
 6.  Executors understand each other only if they have the same declaration: its digest is in the
     name of the topic.  Each process has its own topic, so that it does not receive its own
     announcements.

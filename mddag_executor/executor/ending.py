@@ -52,7 +52,6 @@ class Ending:
     Ends the parts of an executor, each once.
 
     :ivar is_asked: whether the executor has been asked to end.
-    :ivar is_asked: whether the executor has been asked to end.
     :ivar stepping: the epoll of ``spin_once``, once there is one.
     """
 

@@ -166,8 +166,7 @@ def feasible(
                 if not horizon:
                     late &= lengths[index] + overheads + latest < duration_ns
                 possible &= ~late
-            jobs = max(0, (duration_ns - offsets[index]) // dag.period_ns + 1)
-            jobs = min(1, jobs) if dag.once else jobs
+            jobs = max(0, dag.jobs_in(duration_ns - offsets[index] + 1))
             demand += float(jobs) * of_dag[:, index]
     return possible & (demand <= float(workers) * duration_ns) if horizon else possible
 

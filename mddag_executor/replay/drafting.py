@@ -117,15 +117,17 @@ class System:
                 self._publishers[publisher.node.name][publisher.topic] = False
         sent = recording.publications[recording.publications['execution'] >= 0]
         pairs = np.stack((recording.executions['callback'][sent['execution']], sent['publisher']))
-        different, first = np.unique(pairs, axis=1, return_index=True)
-        for callback, number in different.T[np.argsort(first)].tolist():
+        different, first, pair = np.unique(pairs, axis=1, return_index=True, return_inverse=True)
+        several = np.unique(np.stack((pair.reshape(-1), sent['execution'])), axis=1)
+        counts = np.bincount(several[0].astype(np.int64), minlength=len(first))
+        by_time = np.argsort(first)
+        for (callback, number), count in zip(
+                different.T[by_time].tolist(), counts[by_time].tolist()):
             known = publishers.get(number)
             if known is not None:
                 runs = self._runs[callback]
                 runs.topics.append(known.topic)
-                mine = (pairs[0] == callback) & (pairs[1] == number)
-                runs.published[known.topic] = runs.published.get(known.topic, 0) + len(
-                    np.unique(sent['execution'][mine]))
+                runs.published[known.topic] = runs.published.get(known.topic, 0) + count
                 if known.node is not None:
                     self._publishers[known.node.name][known.topic] = True
 

@@ -322,9 +322,10 @@ class LoadBuilder:
         needed: dict[tuple[int, int], int] = {}
         for dag, first in zip(self._task_set.dags, self._first):
             for vertex in dag.vertices:
-                optional = {(before.index, topic): place for before in dag.vertices
-                            for place, (after, topic) in enumerate(
-                                optional_edges(before, dag.vertices)) if after == vertex.index}
+                optional = {
+                    (before, topic): place for before in vertex.predecessors
+                    for place, (after, topic) in enumerate(optional_edges(
+                        dag.vertices[before], dag.vertices)) if after == vertex.index}
                 several = {before for before, _ in optional}
                 for (place, before), edge in zip(
                         legs_of(vertex, dag.vertices), self._edges_into[first + vertex.index]):
