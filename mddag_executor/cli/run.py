@@ -31,7 +31,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, verdicts
 from mddag_executor.cli.main import SAME_SIGNAL_S
-from mddag_executor.cli.text import Progress, warn
+from mddag_executor.cli.text import Progress, set_quiet, warn
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
 from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
@@ -52,6 +52,9 @@ mddag run graph.yaml --node my_package/driver --node my_package.filter:main --tr
 mddag run config/autoware.yaml --synthetic sleep --utilisation 0.6 --duration 20s
 mddag run --node my_package/driver --node my_package/filter --trace run.mcap"""
 
+# What a process of several does not get: it is of the run as a whole, or each process has its own.
+_OF_THE_RUN = {'node', 'synthetic', 'graph', 'trace', 'process', 'processes', 'part', 'on_exit',
+               'fail_on_miss', 'json', 'main'}
 # An end that takes longer than this writes the stack of each thread: well above the duration of an
 # end with slow callbacks, middleware and disk.
 STUCK_S = 40.0
@@ -105,6 +108,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--json', '--overwrite', '--ros-args')
 
 
+def passed_on(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that each process of several gets."""
+    return {name: value for name, value in vars(args).items() if name not in _OF_THE_RUN}
+
+
 def _or_off(text: str) -> int:
     """Return the nanoseconds of a time, 0 for `off`."""
     return 0 if text == 'off' else options.duration(text)
@@ -151,6 +159,7 @@ def part(args: argparse.Namespace) -> int:
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
     vars(args).update(the_part.options)
+    set_quiet(args.quiet)
     task_set = loads(the_part.text, name=args.graph)
     if args.process is None:
         from mddag_executor.hosting.host import nodes_of

@@ -22,7 +22,7 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.cli import common, verdicts
 from mddag_executor.cli.main import EXIT_DEFECT
-from mddag_executor.cli.run import incomplete, not_found, Signals, warn_of
+from mddag_executor.cli.run import incomplete, not_found, passed_on, Signals, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
 from mddag_executor.output_rules import remove_recording
@@ -31,8 +31,6 @@ from msg_graph import TaskSet
 from msg_graph.edit import load_processes, with_processes
 from msg_graph.errors import did_you_mean, listed, shown
 
-_COMMON_OPTIONS = ('policy', 'on_late', 'workers', 'duration', 'seed', 'utilisation',
-                   'diagnostics', 'overwrite', 'ros_args')
 _PROBE_TIMEOUT_S = 120.0
 
 
@@ -63,7 +61,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         workers = defaults.workers(args.workers, task_set)
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with tempfile.TemporaryDirectory(prefix='mddag-') as folder, Signals() as signals:
-        common_options = {name: getattr(args, name) for name in _COMMON_OPTIONS}
+        common_options = passed_on(args)
         Part.make(folder, task_set.text, common_options)
         task_set, specs = _placed(args, task_set, plan, folder)
         Part.make(folder, task_set.text, common_options)
@@ -216,7 +214,7 @@ def _probe(
 
 
 def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> list[str]:
-    """Return the command line of a part, up to its name; see ``_COMMON_OPTIONS``."""
+    """Return the command line of a part, up to its name; its options are in the folder."""
     nodes = [word for spec in specs for word in ('--node', spec)]
     return [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
             *(nodes if args.synthetic is None else ('--synthetic', args.synthetic))]
