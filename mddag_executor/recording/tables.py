@@ -172,6 +172,8 @@ class Recording:
     :ivar worker_names: names of workers, if they are more than a number.
     :ivar links: whether ``message`` is the publication that started an execution; otherwise the
         job links them.
+    :ivar unsent: if no publishers are recorded: by the vertices of an edge the jobs in which the
+        message of ``may_publish`` that joins them was not published.
     :ivar callback_vertex: by callback a vertex of its declared callback, for executions without
         job.
     :ivar messages: number of messages of an ordinary bag; None: it is a trace.
@@ -215,6 +217,7 @@ class Recording:
     process_names: Mapping[int, str] = field(default_factory=dict)
     worker_names: Sequence[str] = ()
     links: bool = False
+    unsent: Mapping[tuple[int, int], Ints] = field(default_factory=dict)
     callback_vertex: dict[int, int] = field(default_factory=dict)
     messages: int | None = None
     whole: Recording | None = field(default=None, repr=False)

@@ -92,7 +92,7 @@ class ComputedRun(NamedTuple):
                                 DEFAULT_DEADLINE_NS, 0, False),
             task_set, task_set, who, same=False, releases=releases, executions=executions,
             job_ends=job_ends, drops=found.drops(), drop_reasons=('newer', 'expired'),
-            demotions=found.demotions(),
+            demotions=found.demotions(), unsent=found.unsent(),
             start=tables.earliest(releases['release'], executions['ready']),
             end=self.end, judged=self.judged, judged_until=self.end, workers_each=workers,
             judge_from=self.judge_from, judged_releases=self.judged_releases)
@@ -305,3 +305,19 @@ class _Tables:
         _, dag, vertex, job, _, time = self._decisions[:, self._decisions[0] == SINK_DEMOTED]
         return tables.rows(tables.DEMOTIONS, len(dag), dag=dag, vertex=vertex,
                            job=self._numbers(dag, job), time=time)
+
+    def unsent(self) -> dict[tuple[int, int], Ints]:
+        """Return by the vertices of an edge the jobs in which nothing was published on it."""
+        tables, load = self._tables, self._load
+        if not len(load.delay_base) or not any(tables.is_optional):
+            return {}
+        found = {}
+        for place, ((before, after), edge) in enumerate(edge_numbers(tables).items()):
+            if tables.is_optional[place]:
+                dag = tables.dag_of[before]
+                jobs = np.unique(load.jobs[load.dags == dag])
+                delays = load.delays[
+                    load.delay_base[dag] + jobs * load.delay_stride[dag] + edge]
+                silent = jobs[delays >= NEVER]
+                found[before, after] = self._numbers(np.full(len(silent), dag), silent)
+        return found

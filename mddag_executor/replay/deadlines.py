@@ -54,6 +54,7 @@ from mddag_executor.core.state import (
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.tables import (
+    different,
     in_parts,
     Ints,
     JobNumbers,
@@ -84,6 +85,7 @@ _COMPLETIONS = np.dtype([
     ('row', 'i4'), ('vertex', 'i4'), ('order', 'i4'), ('job', 'i8')])
 """Columns of a completion: the row of the execution, and some of its columns."""
 
+_NO_JOBS: Ints = np.empty(0, dtype=np.int64)
 _ENDS = {
     recorded.EXPIRED: (EXPIRED, SINK_EXPIRED), recorded.ABORTED: (ABORTED, SINK_ABORTED),
     recorded.FAILED: (FAILED, SINK_FAILED), recorded.OUTDATED: (OUTDATED, SINK_DROPPED)}
@@ -249,33 +251,48 @@ class Judged:
 
         That is the position at which a vertex completed that has not published (rule 3).
         """
-        vertices = self.task_set.dags[dag].vertices
+        vertices, first = self.task_set.dags[dag].vertices, self.tables.first_vertex[dag]
         found = np.full(position.shape, NEVER)
         if not any(vertex.callback.may_publish for vertex in vertices):
             return found
         for v in topological_order(self.task_set.dags[dag]):
             vertex = vertices[v]
-            maybe = optional_edges(vertex, vertices)
-            for after, topic in maybe:
-                silent = np.where(self._published(dag, v, topic, jobs), NEVER, position[:, v])
-                np.minimum(found[:, after], silent, out=found[:, after])
+            for after, topic in optional_edges(vertex, vertices):
+                silent = self._is_silent(first + v, first + after, topic, jobs)
+                silent_from = np.where(silent, position[:, v], NEVER)
+                np.minimum(found[:, after], silent_from, out=found[:, after])
             for after in vertex.successors:
                 np.minimum(found[:, after], found[:, v], out=found[:, after])
         return found
 
-    def _published(self, dag: int, vertex: int, topic: str, jobs: Jobs) -> Mask:
-        """Return by job whether a vertex has published a topic."""
+    def _is_silent(self, vertex: int, after: int, topic: str, jobs: Jobs) -> Mask:
+        """Return by job whether a vertex did not publish a topic that starts another vertex."""
         recording = self._recording
-        sent, publishers = recording.publications, recording.who.every_publisher
-        numbers = [number for number, each in publishers.items() if each.topic == topic]
-        by = sent['execution'][np.isin(sent['publisher'], numbers)]
-        by = by[by >= 0]
-        ran = recording.executions
-        mine = by[ran['vertex'][by] == self.tables.first_vertex[dag] + vertex]
-        published = np.zeros(len(jobs.number), dtype=np.bool_)
-        row = jobs.rows_of(ran['job'][mine])
-        published[row[row >= 0]] = True
-        return published
+        if recording.who.every_publisher:
+            row = jobs.rows_of(self._published.get((vertex, topic), _NO_JOBS))
+            silent = np.ones(len(jobs.number), dtype=np.bool_)
+            silent[row[row >= 0]] = False
+        else:   # a computed run records no publications, but what was not sent
+            row = jobs.rows_of(recording.unsent.get((vertex, after), _NO_JOBS))
+            silent = np.zeros(len(jobs.number), dtype=np.bool_)
+            silent[row[row >= 0]] = True
+        return silent
+
+    @cached_property
+    def _published(self) -> dict[tuple[int, str], Ints]:
+        """Return by vertex and topic of ``may_publish`` the jobs in which it was published."""
+        topics = sorted({t for each in self.task_set.callbacks for t in each.may_publish})
+        publishers = self._recording.who.every_publisher
+        sent, ran = self._recording.publications, self._recording.executions
+        found: dict[tuple[int, str], Ints] = {}
+        for topic in topics:
+            numbers = [number for number, each in publishers.items() if each.topic == topic]
+            which = np.isin(sent['publisher'], numbers) & (sent['execution'] >= 0)
+            by = sent['execution'][which]
+            vertices, index = different(ran['vertex'][by])
+            for vertex, mine in zip(vertices.tolist(), rows_by(index, len(vertices))):
+                found[vertex, topic] = ran['job'][by[mine]]
+        return found
 
     def _given_up(self, jobs: Jobs, ends: Table) -> Ints:
         """Note when jobs ended early; return the reason."""

@@ -4,7 +4,7 @@
 
 from mddag_executor.core import NEVER, PolicyError
 from mddag_executor.errors import UsageError
-from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.replay import Replay, replay, ReplayError, reschedule
 from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import PREEMPT, Settings, simulate, START
 from mddag_executor.simulate.deliveries import DELAY_NS
@@ -290,6 +290,39 @@ def test_what_was_not_published_is_not_published_again(computes, tmp_path, call)
     apart = Process('p', ('/camera', '/other')), Process('q', ('/detect', '/brake'))
     delays = reschedule(path, processes=lambda *of: apart).work.load.delays
     assert (set(delays[::2]), set(delays[1::2])) == ({DELAY_NS}, {0, NEVER})
+
+
+SOMETIMES = SELDOM.replace('/image, publishes', '/image, may_publish')
+
+
+def test_a_simulated_run_and_its_trace_publish_each_time(tmp_path, call):
+    graph = tmp_path / 'seldom.yaml'
+    graph.write_text(SOMETIMES.replace('{name: ', '{execution_time: 3ms, name: '))
+    path = tmp_path / 'run.mcap'
+    simulated = call('simulate', graph, '--workers', '2', '--duration', '1s', '--trace', path,
+                     '--json', '-').result['dags']
+    replayed = call('replay', path, '--json', '-').result['dags']
+    for dags in (simulated, replayed):
+        sink = dags['/camera']['sinks']['/brake:act']
+        assert (sink['completed'], sink.get('not_due', 0)) == (10, 0)
+
+
+def test_computed_tables_know_messages_that_were_not_published(tmp_path):
+    trace = Written(tmp_path / 'run.mcap', SOMETIMES, 2)
+    for publisher, topic in ((51, '/image'), (52, '/object')):
+        trace.add('rcl_publisher_init', 0, publisher, 1, publisher, topic, 10)
+    for job, at in enumerate(range(0, 1000, 100)):
+        trace.release(0, job, at)
+        trace.run(0, 0, job, at, at + 2)
+        trace.run(0, 1, job, at + 2, at + 5)
+        if job % 3 == 0:
+            trace.add('rclcpp_publish', at + 4, 52, 0, 0, thread=10)
+            trace.run(0, 2, job, at + 5, at + 6)
+    outcome = reschedule(trace.end(1000))
+    computed = Replay(outcome.computed().recording(2)).tally.result()['dags']
+    assert computed == outcome.tally.result()['dags']
+    sink = computed['/camera']['sinks']['/brake:act']
+    assert (sink['completed'], sink['not_due']) == (4, 6)
 
 
 # --- overheads -----------------------------------------------------------------------------------
