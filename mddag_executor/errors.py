@@ -23,7 +23,11 @@ class MddagError(Exception):
     Base of this package's errors; its text is the one line that the user sees.
 
     The line names the place, says what is wrong and what to do about it.
+
+    :ivar status: the exit status of the command that it ends.
     """
+
+    status = 2
 
 
 class InputError(MddagError):
@@ -57,6 +61,8 @@ class UserCodeError(MddagError):
     The command line shows the traceback of the cause and exits with status 70: the line alone,
     and the status of bad input, would take the node's `FileNotFoundError` for one of this program.
     """
+
+    status = 70
 
 
 class UsageError(MddagError):

@@ -31,6 +31,7 @@ from mddag_executor import __version__
 from mddag_executor.cli.parsing import Parser, unknown, verb_parser
 from mddag_executor.cli.text import label, one_line, set_quiet
 from mddag_executor.errors import from_user_code, MddagError, UsageError, UserCodeError
+from mddag_executor.hosting.signals import SAME_SIGNAL_S
 
 EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70
@@ -38,8 +39,6 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_SIGNAL = 128
 """A shell adds the number of the signal."""
-# Signals within this time are one: `timeout` sends one to the process, and one to its group.
-SAME_SIGNAL_S = 1.0
 
 
 # Each verb and its one-line help, by task. `graph check` is the module `graph_check`.
@@ -154,7 +153,7 @@ def main(
         from mddag_executor.cli.completion import complete
         complete()
     with _ending_signals() as received:
-        status = _status_of(run, sys.argv[1:] if argv is None else argv)
+        status = status_of(run, sys.argv[1:] if argv is None else argv)
     return EXIT_SIGNAL + received[0] if received else status
 
 
@@ -187,7 +186,8 @@ def _ending_signals() -> Iterator[list[int]]:
                 signal.signal(number, signal.SIG_DFL)
 
 
-def _status_of(run: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
+def status_of(run: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
+    """Do what the arguments say; report what is raised, and return the exit status."""
     try:
         # A name that the terminal's encoding lacks is escaped; it must not end the program.
         if isinstance(sys.stdout, io.TextIOWrapper):
@@ -212,7 +212,7 @@ def _status_of(run: Callable[[Sequence[str]], int], argv: Sequence[str]) -> int:
             return EXIT_DEFECT
         for each in _user_lines(error, line):
             print(f'{label("error", sys.stderr)}: {each}', file=sys.stderr)
-        return EXIT_BAD_INPUT if raised is error else EXIT_DEFECT
+        return error.status if isinstance(error, MddagError) else EXIT_BAD_INPUT
 
 
 def _user_lines(error: BaseException, line: str) -> list[str]:

@@ -24,15 +24,13 @@ from pathlib import Path
 import signal
 import sys
 import threading
-import time
-from types import FrameType
-from typing import Any, TYPE_CHECKING
+from typing import Any, NoReturn, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, verdicts
-from mddag_executor.cli.main import SAME_SIGNAL_S
+from mddag_executor.cli.main import status_of
 from mddag_executor.cli.text import Progress, set_quiet, warn
-from mddag_executor.errors import MddagError, UsageError, UserCodeError
+from mddag_executor.errors import from_user_code, MddagError, UsageError, UserCodeError
 from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.text import listed
@@ -40,11 +38,12 @@ from msg_graph import loads, NO_GRAPH
 
 if TYPE_CHECKING:
     from mddag_executor.executor.executor import MultiDeadlineExecutor
+    from mddag_executor.executor.statistics import Watch
     from mddag_executor.hosting.host import Guest, Host
     from mddag_executor.hosting.loading import Program
     from mddag_executor.hosting.measure import ExecutionPlan, Ledger
-    from mddag_executor.hosting.processes import Supervisor
     from mddag_executor.hosting.session import Session
+    from mddag_executor.hosting.signals import Signals
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -130,7 +129,11 @@ def main(args: argparse.Namespace) -> int:
         task_set = with_declared(args, task_set)
     elif task_set.processes:
         task_set = replace(task_set, processes=())
-    result, error = run_here(args, task_set)
+    return run_here(args, task_set, partial(_finish, args))
+
+
+def _finish(args: argparse.Namespace, result: dict[str, Any], error: BaseException | None) -> int:
+    """Show the result; return the exit status, or raise what a node raised."""
     common.show(args, result, live_lines(result))
     status = verdicts.exit_status(args, result['dags'], result['file'] or 'mddag run')
     return _end(error or incomplete(result['trace']) or not_found(args, result), status)
@@ -165,28 +168,43 @@ def part(args: argparse.Namespace) -> int:
         from mddag_executor.hosting.host import nodes_of
         from mddag_executor.hosting.initialised import initialised
         from mddag_executor.hosting.loading import ros_arguments
+
+        def then(names: list[list[str]]) -> NoReturn:
+            the_part.write_result(names)
+            _exit(0)  # without the ends of programs that were only probed
+
         with initialised(args.ros_args):
-            names = nodes_of(args.node, ros_arguments(args.ros_args))
-        the_part.write_result(names)
-        sys.stdout.flush()
-        os._exit(0)  # without the ends of programs that were only probed
-    result, error = run_here(args, task_set)
-    the_part.write_result(result)
-    if args.synthetic is not None and error is None:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(0)  # the nodes are not destroyed one by one: see _run_synthetic
-    return _end(error)
+            nodes_of(args.node, ros_arguments(args.ros_args), then, _leave_main)
+
+    def finish(result: dict[str, Any], error: BaseException | None) -> int:
+        the_part.write_result(result)
+        if args.synthetic is not None and error is None:
+            _exit(0)  # the nodes are not destroyed one by one: see _run_synthetic
+        return _end(error)
+
+    return run_here(args, task_set, finish)
+
+
+def _exit(status: int) -> NoReturn:
+    """End the process here, with whatever runs in other threads."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def _leave_main(finish: Callable[[], int]) -> NoReturn:
+    """End the process from another thread than the main one, as a program still has that."""
+    _exit(status_of(lambda argv: finish(), ()))
 
 
 def run_here(
-    args: argparse.Namespace, task_set: TaskSet
-) -> tuple[dict[str, Any], BaseException | None]:
+    args: argparse.Namespace, task_set: TaskSet, finish: Callable[..., int]
+) -> int:
     """
     Run nodes in this process.
 
-    :return: the result (with what those of several processes are put together from, if it is one
-        of these), and what a node raised.
+    :param finish: gets the result (with what those of several processes are put together from, if
+        it is one of these), and what a node raised; returns the exit status.
     """
     common.check_output(args.trace, recording=True, overwrite=args.overwrite)
     trace = None if args.trace is None else Path(args.trace).absolute()  # nodes may change folders
@@ -199,13 +217,14 @@ def run_here(
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with ExitStack() as stack:
         stack.callback(faulthandler.cancel_dump_traceback_later)
+        from mddag_executor.hosting.signals import Signals
         signals = stack.enter_context(Signals())
         from mddag_executor.hosting.initialised import initialised
         stack.enter_context(initialised(args.ros_args))
         if args.synthetic is None:
             from mddag_executor.hosting.host import Host
             from mddag_executor.hosting.loading import ros_arguments
-            host = stack.enter_context(Host())
+            host = stack.enter_context(Host(signals))
             programs = host.load(args.node, ros_arguments(args.ros_args))
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
@@ -214,13 +233,20 @@ def run_here(
             overwrite=args.overwrite)
         # With `--json -` what nodes print must not get into the JSON.
         output = sys.stdout if common.wants_tables(args) else sys.stderr
+        stdout = sys.stdout
+
+        def leave(outcome: Callable[[], tuple[dict[str, Any], BaseException | None]]) -> NoReturn:
+            sys.stdout = stdout
+            _leave_main(lambda: finish(*outcome()))
+
         try:
             with redirect_stdout(output):
-                return _run(args, task_set, executor, host, programs, plan, signals)
+                outcome = _run(args, task_set, executor, host, programs, plan, signals, leave)
         except MddagError:
             if trace is not None:  # nothing ran: leave no empty trace behind
                 remove_recording(str(trace))
             raise
+    return finish(*outcome)
 
 
 def _end(error: BaseException | None, status: int = 0) -> int:
@@ -229,6 +255,9 @@ def _end(error: BaseException | None, status: int = 0) -> int:
 
     The process ends here if a node's thread would keep the interpreter from ending.
     """
+    if isinstance(error, KeyboardInterrupt):  # which a program did not catch
+        import traceback
+        traceback.print_exception(from_user_code(error))
     if error is not None:
         raise error
     left = [t.name for t in threading.enumerate()
@@ -236,9 +265,7 @@ def _end(error: BaseException | None, status: int = 0) -> int:
     if not left:
         return status
     warn(f'threads that nodes started still run and are left behind: {listed(left)}')
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
+    _exit(status)
 
 
 def _check_arguments(args: argparse.Namespace) -> None:
@@ -272,9 +299,14 @@ def warn_of(plan: ExecutionPlan, n_processes: int = 1) -> None:
 def _run(
     args: argparse.Namespace, task_set: TaskSet, executor: MultiDeadlineExecutor,
     host: Host | None, programs: list[Program], plan: ExecutionPlan | None, signals: Signals,
+    leave: Callable[..., NoReturn],
 ) -> tuple[dict[str, Any], BaseException | None]:
+    """
+    Run nodes; return the result, and what a node raised.
+
+    :param leave: see ``Host.run``.
+    """
     from mddag_executor.executor.statistics import Watch
-    from mddag_executor.hosting.measure import measure
     from mddag_executor.hosting.session import Session
 
     def end_begins() -> None:
@@ -286,15 +318,27 @@ def _run(
     session = Session(executor, on_end=end_begins)
     watch = Watch(executor, task_set)
     seconds = None if args.duration is None else args.duration / 1e9
-    ledger: Ledger | None = None
     signals.end_of(session)
     if host is not None:  # without progress: programs use the terminal, too
-        _run_programs(args, task_set, session, host, programs, seconds)
-    elif plan is not None:
-        with Progress('running', seconds) as progress:
-            if args.part is None:
-                warn_of(plan)
-            ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
+        outcome: tuple[dict[str, Any], BaseException | None] = host.run(
+            partial(_run_programs, args, task_set, session, watch, host, programs, seconds), leave)
+        return outcome
+    assert plan is not None
+    with Progress('running', seconds) as progress:
+        if args.part is None:
+            warn_of(plan)
+        ledger = _run_synthetic(args, session, task_set, plan, seconds, progress)
+    result = _result(args, task_set, session, watch, ledger, plan)
+    return result, _with_place(session.error, result, ())
+
+
+def _result(
+    args: argparse.Namespace, task_set: TaskSet, session: Session, watch: Watch,
+    ledger: Ledger | None = None, plan: ExecutionPlan | None = None,
+) -> dict[str, Any]:
+    """Return the result of a run that has ended."""
+    from mddag_executor.hosting.measure import measure
+    executor: Any = session.executor
     counts = executor.statistics()
     if counts['trace'] is not None:
         counts['trace']['path'] = args.trace
@@ -306,7 +350,7 @@ def _run(
         warn('a callback has not ended in time; it is left behind')
     if args.part is not None:
         result.update(observed=asdict(watch.observed(counts)))
-    return result, _with_place(session.error, result, [] if host is None else host.guests)
+    return result
 
 
 def _with_place(
@@ -315,13 +359,14 @@ def _with_place(
     """Return what a node raised, with the callbacks or the program that raised it."""
     if error is None or isinstance(error, (KeyboardInterrupt, SystemExit)):
         return error
-    from mddag_executor.hosting.loading import describe
-    places = [name for name, each in result['callbacks'].items() if each['failed']] or [
-        f'--node {guest.program.spec}' for guest in guests if guest.error is error]
+    from mddag_executor.hosting.loading import describe, MainFailed
+    of_mains = [f'--node {guest.program.spec}' for guest in guests if guest.error is error]
+    places = [name for name, each in result['callbacks'].items() if each['failed']] or of_mains
     if not places and isinstance(error, OSError) and error.filename is None:
         return error  # of this program: too many open files
-    failed = UserCodeError(f'{listed(places) or "mddag run"}: it raised {describe(error)}: '
-                           'correct it, or see its traceback')
+    failed = (MainFailed if of_mains else UserCodeError)(
+        f'{listed(places) or "mddag run"}: it raised {describe(error)}: correct it, or see its '
+        'traceback')
     failed.__cause__ = error
     return failed
 
@@ -360,10 +405,10 @@ def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | N
 
 
 def _run_programs(
-    args: argparse.Namespace, task_set: TaskSet, session: Session, host: Host,
+    args: argparse.Namespace, task_set: TaskSet, session: Session, watch: Watch, host: Host,
     programs: list[Program], seconds: float | None,
-) -> None:
-    from mddag_executor.hosting.loading import ros_arguments
+) -> tuple[dict[str, Any], BaseException | None]:
+    from mddag_executor.hosting.loading import MainFailed, ProgramFailed, ros_arguments
     from mddag_executor.hosting.session import SessionError
     executor: Any = session.executor
     executor.set_judging(False)
@@ -381,59 +426,23 @@ def _run_programs(
                     warn(f'{error}; messages that are lost meanwhile count as missed')
             executor.set_judging(True, begins)
             session.wait(seconds)
-    except MddagError:
+    except MddagError as error:
         # What a callback raised says more than that its program failed to start.
         if session.error is None:
+            if isinstance(error, ProgramFailed):
+                error.status = MainFailed.status
+            elif args.part is not None:  # what it exits with is none of the run's
+                error.status = MddagError.status
             raise
     left = host.end(session.is_patient)
-    for guest in host.guests:
-        if guest.error is not None and session.error is None:
-            session.error = guest.error
     for guest in left:
         warn(f'--node {guest.program.spec}: its main() has not ended in time; it is left behind')
-
-
-class Signals:
-    """
-    Let SIGINT, SIGTERM and SIGHUP end the run, and its report be written; a context manager.
-
-    A SIGINT that comes while a run ends, but not together with the first, interrupts what still
-    runs; the next one interrupts the end itself.
-    """
-
-    def __init__(self) -> None:
-        self._session: Session | Supervisor | None = None
-        self._last: float | None = None  # when one came that counts
-        self._hurried = False
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Signals:
-        return self
-
-    def end_of(self, session: Session | Supervisor) -> None:
-        """From now on they end this session."""
-        self._session = session
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup
-                    self._before[number] = signal.signal(number, self._handle)
-
-    def __exit__(self, *args: object) -> None:
-        for number, before in self._before.items():
-            signal.signal(number, before)
-        for number in self._before if self._last is not None else ():
-            # The process is about to end by itself; it is not to look as if it was killed.
-            signal.signal(number, signal.SIG_IGN)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        now, session = time.monotonic(), self._session
-        if session is None or self._last is None and not session.stopped:
-            self._last = now
-        elif number == signal.SIGINT and (
-                self._last is None or now - self._last > SAME_SIGNAL_S):
-            if self._hurried:
-                signal.default_int_handler(number, frame)
-            self._last, self._hurried = now, True
-            session.hurry()
-        if session is not None:
-            session.stop()
+    if left:
+        host.interrupt()
+    errors = [guest.error for guest in host.guests
+              if guest.error is not None and not (
+                  guest in left and isinstance(guest.error, KeyboardInterrupt))]
+    # what went wrong says more than that it was interrupted
+    errors.sort(key=lambda error: isinstance(error, KeyboardInterrupt))
+    result = _result(args, task_set, session, watch)
+    return result, _with_place(session.error or next(iter(errors), None), result, host.guests)

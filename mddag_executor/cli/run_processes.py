@@ -22,9 +22,10 @@ from typing import Any
 from mddag_executor import defaults
 from mddag_executor.cli import common, verdicts
 from mddag_executor.cli.main import EXIT_DEFECT
-from mddag_executor.cli.run import incomplete, not_found, passed_on, Signals, warn_of
+from mddag_executor.cli.run import incomplete, not_found, passed_on, warn_of
 from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
+from mddag_executor.hosting.signals import Signals
 from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
 from msg_graph import TaskSet

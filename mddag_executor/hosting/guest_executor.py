@@ -19,7 +19,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor.compat import is_called_by_spin
 from mddag_executor.executor.tasks import watched
-from rclpy.executors import Executor
+from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 
 if TYPE_CHECKING:
@@ -84,6 +84,8 @@ class GuestExecutor:
     def _step(self, until: Callable[[], bool], timeout_sec: Any) -> None:
         if self.guest is None and self.is_global:  # for rclpy.spin_once in a callback
             timeout_sec = _STEP_S
+        if self.guest is not None and self.host.is_over(self.guest):
+            raise ExternalShutdownException()
         with self._changed:
             self._n_stepping += 1
         try:
@@ -99,8 +101,11 @@ class GuestExecutor:
         raised: list[BaseException] = []
 
         def is_over() -> bool:
-            if self._errors and not raised:  # each error comes out of one spin
-                raised.append(self._errors.popleft())
+            if not raised:  # each error comes out of one spin
+                if self._errors:
+                    raised.append(self._errors.popleft())
+                elif self.host.take_interrupt(self.guest):
+                    raised.append(KeyboardInterrupt())
             return bool(raised) or self._is_stopped or until()
 
         timeout_s = getattr(timeout_sec, 'timeout', timeout_sec)
@@ -110,11 +115,25 @@ class GuestExecutor:
             self._n_spinning += 1
         try:
             self.host.wait(self._changed, is_over, timeout_s, self.guest)
+        except KeyboardInterrupt as error:
+            self.host.note_interrupt()
+            raised = [error]
         finally:
             with self._changed:
                 self._n_spinning -= 1
         if raised:
+            if isinstance(raised[0], KeyboardInterrupt):
+                self._await_callbacks()
             raise raised[0]
+
+    def _await_callbacks(self) -> None:
+        """Wait until the callbacks that run have finished, if an interrupt ends the run."""
+        while self.host.is_ending():
+            try:
+                self.host.wait(self._changed, lambda: False, None, self.guest)
+                return
+            except KeyboardInterrupt:  # it interrupts the callbacks, too
+                self.host.note_interrupt()
 
     def _adopt(self, nodes: list[Node]) -> None:
         for node in nodes:

@@ -5,20 +5,22 @@ Run unmodified node programs in this process, with all of their nodes on one exe
 
 Theory of operation
 -------------------
-1. Each program runs in its own thread.  A thread that a program starts belongs to the program.
+1. The first program runs in the main thread (``Host.run``), so all that Python allows there only
+   is as without this package: signals (see ``signals``), KeyboardInterrupt, asyncio.  Each further
+   program runs in its own thread.  A thread that a program starts belongs to the program.
 2. While a ``Host`` is entered, these functions are replaced:
 
    =================================  ============================================================
    ``init`` of the default context    does nothing: the context is initialised already; after the
                                       program's ``shutdown`` its nodes run again
    ``init`` of another context        warns that what runs in it is not judged
+   ``install_signal_handlers``        notes which signals end the run
    its ``shutdown``                   called by a program's thread, ends that program; called by
                                       any other thread (in a callback), ends the run
    its ``ok``                         is also False in the threads of a program that has ended
    ``Executor.__init__``              makes a ``GuestExecutor`` of the executor
    ``get_global_executor``            returns a ``GuestExecutor`` of the calling program
    ``EventsExecutor``                 makes a ``GuestExecutor``
-   ``signal.signal``, ``getsignal``   keep a handler for each program: see ``guest_signals``
    =================================  ============================================================
 
    Afterwards the working directory is the earlier one, too, if that still exists: paths of results
@@ -27,6 +29,8 @@ Theory of operation
 3. A program that spins passes its nodes to the host's executor and waits until the run or the
    program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are then
    removed, unless it has returned them.  The run ends when the last main has returned.
+   If a SIGINT ends the run, the spin of the program in the main thread raises KeyboardInterrupt
+   when no callback runs any more, as do those in the threads of the other mains.
 4. An exception of a callback is raised by the spin of its program.  Nodes that a program has
    returned have no such spin: their exceptions end the run.
 
@@ -41,29 +45,41 @@ import asyncio
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 import os
+from queue import SimpleQueue
+import signal
 import sys
 import threading
 import time
-from typing import Any
+from typing import Any, NoReturn, TypeVar
 import weakref
 
 from mddag_executor.executor.compat import alive, executor_kept
 from mddag_executor.executor.registry import snapshot
 from mddag_executor.executor.work import current
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
-from mddag_executor.hosting.guest_signals import GuestSignals
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
+from mddag_executor.hosting.signals import Signals
 from mddag_executor.replacements import instead, Replacements
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 import rclpy.utilities
 
 START_TIMEOUT_S = 10.0
+_INTERRUPT_S = 1.0
+"""How long a program in the main thread that does not end may take after a KeyboardInterrupt."""
+_SIGNALS_OF = {
+    SignalHandlerOptions.ALL: (signal.SIGINT, signal.SIGTERM),
+    SignalHandlerOptions.SIGINT: (signal.SIGINT,),
+    SignalHandlerOptions.SIGTERM: (signal.SIGTERM,)}
+
+Result = TypeVar('Result')
 
 
 @dataclass(eq=False)
@@ -78,6 +94,10 @@ class Guest:
     :ivar returned: whether its main has returned nodes.
     :ivar uses_ros: whether it has initialised rclpy.
     :ivar error: the exception that has ended its main.
+    :ivar done: is set when all that follows its main is done, too.
+    :ivar signals: those that rclpy handles for it, with the Python handler of each at that time,
+        which rclpy's calls.
+    :ivar interrupted: whether a SIGINT has come that its next spin raises.
     """
 
     program: Program
@@ -89,6 +109,9 @@ class Guest:
     returned: bool = False
     uses_ros: bool = False
     error: BaseException | None = None
+    done: threading.Event = field(default_factory=threading.Event)
+    signals: dict[int, Any] = field(default_factory=dict)
+    interrupted: bool = False
     global_executor: Any = None
 
 
@@ -96,10 +119,11 @@ class Host:
     """
     Runs programs in the default context; a context manager.
 
+    :param signals: tells what becomes of signals; None: they are nothing of the host's.
     :ivar executor: runs the nodes of all programs; None before ``start``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, signals: Signals | None = None) -> None:
         self.executor: Any = None
         self.guests: list[Guest] = []
         self.global_executor: Any = None  # of callbacks: they belong to no program's thread
@@ -114,14 +138,17 @@ class Host:
         self._of_callbacks: Any = weakref.WeakSet()  # threads
         # the node behind each object that a program has added as a node
         self._behind: Any = weakref.WeakKeyDictionary()
-        self._signals = GuestSignals(self)
+        self._signals = signals or Signals()
+        self._signals.ends_run, self._signals.wake = self.ends_run, self.wake
+        # the thread that the first program gets, and the way to it
+        self._main: threading.Thread | None = None
+        self._of_main: SimpleQueue[Guest | None] = SimpleQueue()
         self._replacements = Replacements()
 
     def __enter__(self) -> Host:
         context = self.context = rclpy.utilities.get_default_context()
         replace = self._replacements.replace
         self._replacements.callback(_return_to, os.getcwd())
-        self._signals.install(self._replacements)
         for name, function in (('init', self._init), ('ok', self._ok),
                                ('shutdown', self._shutdown), ('try_shutdown', self._shutdown)):
             setattr(context, name, function)
@@ -129,7 +156,8 @@ class Host:
         for module in (rclpy, rclpy.utilities):  # they would also make a new default context
             replace(module, 'shutdown', instead(self._shutdown))
             replace(module, 'try_shutdown', instead(self._shutdown))
-        replace(rclpy, 'install_signal_handlers', instead(lambda *args: None))
+        replace(rclpy, 'install_signal_handlers', instead(self._install_signal_handlers))
+        replace(rclpy, 'uninstall_signal_handlers', instead(self._uninstall_signal_handlers))
         replace(rclpy, 'get_global_executor', instead(self._global_executor))
         replace(Executor, '__init__', self._executor_init)
         replace(Context, 'init', self._init_other)
@@ -157,6 +185,50 @@ class Host:
         finally:
             self._loading = False
 
+    def run(
+        self, supervise: Callable[[], Result], leave: Callable[[Callable[[], Result]], NoReturn]
+    ) -> Result:
+        """
+        Call a function in a thread of its own, and run in this thread the program that it starts.
+
+        :param supervise: calls ``start``; it returns when the run has ended.
+        :param leave: is called by that thread, after the end, if the program keeps this thread;
+            gets what returns the result of ``supervise`` or raises its exception.
+        :return: the result of ``supervise``.
+        """
+        outcome: Callable[[], Result]
+
+        def body() -> None:
+            nonlocal outcome
+            try:
+                outcome = partial(_same, supervise())
+            except BaseException as error:
+                outcome = partial(_raise, error)
+            if self.end():
+                self.interrupt()
+            self._of_main.put(None)
+            if self.guests and not self.guests[0].done.is_set() and self._has_main(self.guests[0]):
+                leave(outcome)
+
+        self._main = threading.current_thread()
+        supervisor = threading.Thread(target=body, name='mddag-run', daemon=True)
+        supervisor.start()
+        guest = self._of_main.get()
+        if guest is not None:
+            self._run(guest)
+        supervisor.join()
+        return outcome()
+
+    def interrupt(self) -> None:
+        """Raise KeyboardInterrupt in the main thread, if a program is there, and wait for it."""
+        for guest in filter(self._has_main, self.guests):
+            if not guest.done.is_set():
+                self._signals.interrupt()
+                guest.done.wait(_INTERRUPT_S)
+
+    def _has_main(self, guest: Guest | None) -> bool:
+        return guest is not None and guest.thread is self._main
+
     def start(
         self, executor: Any, programs: Iterable[Program], arguments: Iterable[str] = (),
         end_run: Callable[[], None] = lambda: None, is_ending: Callable[[], bool] = lambda: False,
@@ -183,14 +255,20 @@ class Host:
             if is_ending():
                 break
             guest = Guest(program)
-            guest.thread = threading.Thread(
-                target=self._run, args=(guest,), daemon=True, name=f'main of {program.spec}')
-            self.guests.append(guest)
-            self.guest_of[guest.thread] = guest
             sys.argv = [program.argv0, *program.arguments, *arguments]
-            guest.thread.start()
+            if self._main is not None and not self.guests:
+                guest.thread = self._main
+                self.guests.append(guest)
+                self._of_main.put(guest)
+            else:
+                guest.thread = threading.Thread(
+                    target=self._run, args=(guest,), daemon=True, name=f'main of {program.spec}')
+                self.guests.append(guest)
+                guest.thread.start()
             self._wait_for_nodes(guest)
             self._check_start(guest)
+            if isinstance(guest.error, KeyboardInterrupt):
+                break
         self._all_started = True
         self._end_run_after_last()
 
@@ -203,10 +281,16 @@ class Host:
         spec = guest.program.spec
         if isinstance(guest.error, LoadingError):
             raise guest.error
-        if guest.error is not None and not (
-                isinstance(guest.error, SystemExit) and guest.uses_ros):  # its exit status
-            failure = LoadingError if isinstance(guest.error, SystemExit) else ProgramFailed
-            raise failure(
+        if isinstance(guest.error, SystemExit) and not guest.uses_ros:
+            code = guest.error.code
+            failed = LoadingError(
+                spec, f'it ended while starting ({describe(guest.error)})',
+                'correct it, or see how it runs by itself')
+            failed.status = code if isinstance(code, int) else 1
+            raise failed from guest.error
+        if guest.error is not None and not isinstance(
+                guest.error, (SystemExit, KeyboardInterrupt)):
+            raise ProgramFailed(
                 spec, f'it failed while starting ({describe(guest.error)})',
                 'correct it, or see how it runs by itself') from guest.error
         if guest.ended and not guest.nodes and not guest.uses_ros:
@@ -216,10 +300,28 @@ class Host:
 
     def _run(self, guest: Guest) -> None:
         """Run a program in its thread."""
-        loop = asyncio.new_event_loop()  # as the main thread of a program has one
-        asyncio.set_event_loop(loop)
+        self.guest_of[guest.thread] = guest
         try:
-            value = guest.program.run()
+            if self._has_main(guest):
+                with self._signals.of_program():
+                    self._run_main(guest)
+            else:
+                loop = asyncio.new_event_loop()  # as the main thread of a program has one
+                asyncio.set_event_loop(loop)
+                self._run_main(guest)
+                loop.close()
+        finally:
+            self.guest_of.pop(guest.thread, None)
+            guest.is_complete = True
+            guest.done.set()
+
+    def _run_main(self, guest: Guest) -> None:
+        try:
+            try:
+                value = guest.program.run()
+            finally:
+                if self._has_main(guest):
+                    self._signals.take_back()
             nodes = _nodes_in(value)
             if nodes is None:
                 if not guest.uses_ros and not isinstance(value, int):
@@ -245,8 +347,6 @@ class Host:
         guest.finished = True
         if guest.error is not None or not guest.returned:
             self.program_ended(guest)
-        loop.close()
-        guest.is_complete = True
 
     def program_ended(self, guest: Guest) -> None:
         """Remove a program's nodes and end its spins; end the run after the last program."""
@@ -264,7 +364,8 @@ class Host:
 
     def program_failed(self, guest: Guest, error: BaseException) -> None:
         """Report a program's exception at once, if other programs continue."""
-        if not all(each.ended for each in self.guests):
+        if not all(each.ended for each in self.guests) and not (
+                isinstance(error, KeyboardInterrupt) and self._is_ending()):
             get_logger('mddag_executor').error(
                 f'--node {guest.program.spec}: its main has raised {describe(error)}: its nodes '
                 'run no more')
@@ -286,10 +387,10 @@ class Host:
         if self.guests:
             self.shut_down()
         for guest in self.guests:
-            while guest.thread.is_alive() and is_patient():
-                guest.thread.join(0.02)
-            guest.thread.join(0.1)
-        return [guest for guest in self.guests if guest.thread.is_alive()]
+            while not guest.done.is_set() and is_patient():
+                guest.done.wait(0.02)
+            guest.done.wait(0.1)
+        return [guest for guest in self.guests if not guest.done.is_set()]
 
     # --- nodes and callbacks ---------------------------------------------------------------------
 
@@ -379,6 +480,55 @@ class Host:
         self._ended = True
         self.wake()
 
+    # --- signals ---------------------------------------------------------------------------------
+
+    def ends_run(self, number: int) -> bool:
+        """
+        Let programs note a signal; return whether it ends the run.
+
+        It does so if rclpy would shut the context of a program down, or if no program is there
+        that could get it.
+        """
+        running = [guest for guest in self.guests if not guest.done.is_set()]
+        nodes_only = [guest for guest in self.guests if guest.returned and not guest.ended]
+        ends = not running or bool(nodes_only) and number == signal.SIGINT
+        for guest in running:
+            if self._has_main(guest):  # unless the program has replaced the handler meanwhile
+                ends |= number in guest.signals and (
+                    guest.signals[number] == signal.getsignal(number))
+            elif number == signal.SIGINT:
+                guest.interrupted = True
+                ends |= number in guest.signals
+        return ends
+
+    def take_interrupt(self, guest: Guest | None) -> bool:
+        """Return whether the calling thread is that of a main which a SIGINT has interrupted."""
+        if guest is None or not guest.interrupted or (
+                guest.thread is not threading.current_thread()):
+            return False
+        guest.interrupted = False
+        return True
+
+    def note_interrupt(self) -> None:
+        """Note a KeyboardInterrupt in the main thread."""
+        if self._main is threading.current_thread():
+            self._signals.interrupted()
+
+    def is_ending(self) -> bool:
+        """Return whether the run is to end."""
+        return self._is_ending()
+
+    def _install_signal_handlers(self, options: Any = SignalHandlerOptions.ALL) -> None:
+        guest = self.current_guest()
+        if guest is not None:
+            for number in _SIGNALS_OF.get(options, ()):
+                guest.signals[number] = signal.getsignal(number)
+
+    def _uninstall_signal_handlers(self) -> None:
+        guest = self.current_guest()
+        if guest is not None:
+            guest.signals.clear()
+
     # --- replacements in rclpy and Python --- ----------------------------------------------------
 
     def current_guest(self) -> Guest | None:
@@ -436,6 +586,7 @@ class Host:
         elif guest is None:
             self.end_run()
         else:
+            guest.signals.clear()
             self.program_ended(guest)
 
     def _executor_init(self, original: Callable[..., None]) -> Callable[..., None]:
@@ -459,24 +610,41 @@ class Host:
             return owner.global_executor
 
 
-def nodes_of(specs: Iterable[str], arguments: Iterable[str] = ()) -> list[list[str]]:
+def nodes_of(
+    specs: Iterable[str], arguments: Iterable[str], then: Callable[[list[list[str]]], NoReturn],
+    leave: Callable[[Callable[[], NoReturn]], NoReturn],
+) -> NoReturn:
     """
-    Run programs until their nodes exist; return the names of the nodes of each program.
+    Run programs until their nodes exist.
 
-    No callback runs.  The process must be ended afterwards.
+    No callback runs.
 
+    :param then: gets the names of the nodes of each program; it ends the process.
+    :param leave: see ``Host.run``.
     :raises LoadingError: as ``Host.load`` and ``start``, or when a program makes no node in time.
     """
     arguments = list(arguments)
-    with Host() as host:
-        programs = host.load(specs, arguments)
+
+    def supervise() -> NoReturn:
         host.start(SingleThreadedExecutor(), programs, arguments)
         for guest in host.guests:
             if not guest.nodes:
                 raise LoadingError(
                     guest.program.spec, f'it has made no node in {START_TIMEOUT_S:g} s, so its '
                     'process is unknown', f'name that: PROCESS={guest.program.spec}')
-        return [[n.get_fully_qualified_name() for n in guest.nodes] for guest in host.guests]
+        then([[n.get_fully_qualified_name() for n in guest.nodes] for guest in host.guests])
+
+    with Host() as host:
+        programs = host.load(specs, arguments)
+        host.run(supervise, leave)
+
+
+def _same(value: Result) -> Result:
+    return value
+
+
+def _raise(error: BaseException) -> NoReturn:
+    raise error
 
 
 def _return_to(folder: str) -> None:

@@ -70,6 +70,12 @@ class Program:
     arguments: tuple[str, ...] = ()
 
 
+class MainFailed(UserCodeError):
+    """A program whose main raised, which is the cause; the status is Python's."""
+
+    status = 1
+
+
 def resolve(text: str, ros_arguments: Iterable[str] = ()) -> Program:
     """
     Find the program of a SPEC; its arguments may follow, as in a shell.

@@ -13,9 +13,9 @@ import sys
 import threading
 import time
 
-from mddag_executor.cli.main import SAME_SIGNAL_S
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
+from mddag_executor.hosting.signals import SAME_SIGNAL_S
 import pytest
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
@@ -80,17 +80,13 @@ GOES_ON = {
     'spins_once_for_ever': ['for_ever heard five'],
     'steps': ['30 steps'],
     'calls_a_service': ['answer: forty-two'],
-    'catches_signals': ['catcher heard five', 'read the settings again'],
-    'handles_a_signal': [
-        f'while it worked: signal {signal.SIGUSR1:d}', f'while it spun: signal {signal.SIGUSR1:d}',
-        'one handler: True'],
     'handles_its_exceptions': ['rclpy raised odd', 'executor raised odd'],
     'spins_in_callbacks': [
         f'{way} forty-two' for way in (
             'of the node', 'of rclpy', 'step by step', 'step by step of rclpy')],
     'main': ['listener heard five'],
 }
-AT_THE_END = ['listener ended after its spin', 'no longer ok']
+AT_THE_END = ['listener interrupted, ok: False', 'interrupted in a step']
 
 
 def test_unmodified_programs_run_on_our_executor(world):
@@ -134,32 +130,52 @@ def test_a_run_ends_with_its_last_program(world, mddag):
 def test_what_a_node_raises_while_it_is_removed_ends_the_run(world, mddag):
     """An object that passes on to a node counts as that node, as for rclpy."""
     done = mddag('run', '--node', 'chat:refuses')
-    assert done.returncode == 70 and 'OSError: the device is gone' in done.stderr
+    assert done.returncode == 1 and 'OSError: the device is gone' in done.stderr
     done = mddag('run', '--node', 'chat:passes_on')
     assert (done.returncode, done.stderr) == (0, '')
     assert 'passed on' in done.stdout and '/behind: ' in done.stdout
 
 
-@pytest.mark.parametrize(('name', 'status', 'says'), [
-    ('returns_status', 4, ''), ('returns_reason', 1, 'not calibrated'), ('has_a_loop', 0, ''),
-    ('has_another_context', 0, 'chat:has_another_context: it has a context of its own')])
-def test_a_program_ends_as_without_the_host(world, mddag, name, status, says):
-    done = mddag('run', '--node', f'chat:{name}')
-    assert done.returncode == status and 'Traceback' not in done.stderr, done.stderr
-    assert says in done.stderr and 'no declaration was given' in done.stdout
+PLAIN = 'import sys, chat; sys.exit(getattr(chat, sys.argv[1])())'
 
 
-@pytest.mark.parametrize(('names', 'lines'), [
-    (['no_longer_spins'], ['results due']),     # no spin waits for what its callback raises
-    (['waits_for_a_task'], ['Traceback', '--node chat:waits_for_a_task: ']),
-    (['raises_in_a_callback', 'shuts_down_in_a_callback'], [
+@pytest.mark.parametrize(('name', 'status'), [
+    ('returns_status', 4), ('returns_reason', 1), ('has_a_loop', 0), ('handles_signals', 3),
+    ('stops_the_robot', 0), ('is_interrupted', 130), ('works_with_asyncio', 1),
+    ('fails_at_the_end', 1), ('exits_early', 5)])
+def test_a_program_behaves_as_without_the_host(world, mddag, name, status):
+    """It has the main thread: what it prints, what it raises and its exit status are the same."""
+    plain = subprocess.run(
+        [sys.executable, '-c', PLAIN, name], capture_output=True, text=True, timeout=60)
+    hosted = mddag('run', '--node', f'chat:{name}')
+    assert hosted.returncode == status, hosted.stderr
+    assert status == (plain.returncode if plain.returncode >= 0 else 128 - plain.returncode)
+    assert hosted.stdout.startswith(plain.stdout), hosted.stdout
+    if 'Traceback' in plain.stderr or name == 'returns_reason':
+        assert plain.stderr.splitlines()[-1] in hosted.stderr
+    elif name != 'exits_early':
+        assert hosted.stderr == plain.stderr
+    assert ('Traceback' in hosted.stderr) == ('Traceback' in plain.stderr)
+
+
+def test_a_context_of_a_programs_own_is_left_alone(world, mddag):
+    done = mddag('run', '--node', 'chat:has_another_context')
+    assert done.returncode == 0 and 'Traceback' not in done.stderr, done.stderr
+    assert 'chat:has_another_context: it has a context of its own' in done.stderr
+    assert 'no declaration was given' in done.stdout
+
+
+@pytest.mark.parametrize(('names', 'status', 'lines'), [
+    (['no_longer_spins'], 70, ['results due']),     # no spin waits for what its callback raises
+    (['waits_for_a_task'], 1, ['Traceback', '--node chat:waits_for_a_task: ']),
+    (['raises_in_a_callback', 'shuts_down_in_a_callback'], 1, [
         '--node chat:raises_in_a_callback: its main has raised ZeroDivisionError',
         'its nodes run no more', 'shut down', 'results due'])])
-def test_exceptions_come_out_behind_the_summary(world, mddag, names, lines):
+def test_exceptions_come_out_behind_the_summary(world, mddag, names, status, lines):
     """A callback that shuts rclpy down ends the run, one that raises ends its program."""
     done = mddag('run', 'graph.yaml', '--duration', '50s', *(
         word for name in names for word in ('--node', f'chat:{name}')))
-    assert done.returncode == 70
+    assert done.returncode == status
     assert 'ZeroDivisionError' in done.stderr.splitlines()[-1]
     for line in lines:
         assert line in done.stdout + done.stderr
@@ -239,45 +255,20 @@ def host(default_context):
 def test_rclpy_is_as_before_when_the_host_is_left(default_context):
     def main():
         rclpy.init()
-        signal.signal(signal.SIGUSR1, lambda *_: None)
 
     def parts():
         context = rclpy.get_default_context()
         return [
             rclpy.shutdown, rclpy.try_shutdown, rclpy.get_global_executor,
-            rclpy.install_signal_handlers, rclpy.experimental.EventsExecutor, signal.signal,
-            signal.getsignal, Executor.__init__, threading.Thread.start, {*vars(context)},
-            signal.getsignal(signal.SIGUSR1)]
+            rclpy.install_signal_handlers, rclpy.uninstall_signal_handlers,
+            rclpy.experimental.EventsExecutor, Executor.__init__, threading.Thread.start,
+            {*vars(context)}]
 
     before = parts()
     with Host() as host:
         host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])
-        assert not any(now == was for now, was in zip(parts()[:-1], before))
+        assert not any(now == was for now, was in zip(parts(), before))
     assert parts() == before
-    host.executor.shutdown()
-
-
-def test_a_hangup_ends_the_run_unless_a_running_program_handles_it(default_context):
-    """Programs that have ended handle nothing, and their nodes run no more."""
-    got = []
-
-    def main():
-        rclpy.init()
-        signal.signal(signal.SIGHUP, lambda *_: got.append('program'))
-        return Node('node')
-
-    before = signal.signal(signal.SIGHUP, lambda *_: got.append('run'))
-    try:
-        with Host() as host:
-            host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])
-            os.kill(os.getpid(), signal.SIGHUP)
-            assert wait_for(lambda: got == ['program']) and host.executor.get_nodes()
-            host.program_ended(host.guests[0])
-            assert host.executor.get_nodes() == []
-            os.kill(os.getpid(), signal.SIGHUP)
-            assert wait_for(lambda: got == ['program', 'run'])
-    finally:
-        signal.signal(signal.SIGHUP, before)
     host.executor.shutdown()
 
 
@@ -311,7 +302,7 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host, kind):
 
 
 @pytest.mark.parametrize(('spec', 'message'), [
-    ('chat:exits', 'it failed while starting (SystemExit: 3'),
+    ('chat:exits_early', 'it ended while starting (SystemExit: 5'),
     ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
     ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
     ('chat:returns_text', 'it returned a str, which is no rclpy node'),
@@ -337,11 +328,12 @@ def test_a_program_whose_start_the_end_of_the_run_cuts_off_has_not_failed(
 
 
 def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag):
-    done = mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'out.mcap')
-    assert (done.returncode, done.stderr.count('\n')) == (2, 1), done.stderr
+    done = mddag('run', 'graph.yaml', '--node', 'chat:exits_early', '--trace', 'out.mcap')
+    assert (done.returncode, done.stderr.count('\n')) == (5, 1), done.stderr
     assert not Path('out.mcap').exists()
     Path('null').symlink_to('/dev/null')    # a device stays, also if root names it
-    assert mddag('run', 'graph.yaml', '--node', 'chat:exits', '--trace', 'null').returncode == 2
+    done = mddag('run', 'graph.yaml', '--node', 'chat:exits_early', '--trace', 'null')
+    assert done.returncode == 5
     assert Path('null').is_symlink()
 
 

@@ -5,6 +5,7 @@
 import asyncio
 import os
 import signal
+import sys
 import threading
 import time
 
@@ -43,13 +44,22 @@ class Listener(Node):
         return self.create_client(Trigger, '~/own', **more)
 
 
+def spin_to_the_end(node):
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+
+
 def main():
     rclpy.init()
     node = Listener()
-    rclpy.spin(node)
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        print(f'listener interrupted, ok: {rclpy.ok()}')
     node.destroy_node()
-    rclpy.shutdown()
-    print('listener ended after its spin')
+    rclpy.try_shutdown()
 
 
 def two():
@@ -81,9 +91,11 @@ def spins_in_thread():
 def spins_once_for_ever():
     rclpy.init()
     node = Listener('for_ever')
-    while rclpy.ok():
-        rclpy.spin_once(node)
-    print('no longer ok')
+    try:
+        while rclpy.ok():
+            rclpy.spin_once(node)
+    except KeyboardInterrupt:
+        print('interrupted in a step')
 
 
 def steps():
@@ -93,7 +105,7 @@ def steps():
     for _ in range(30):
         rclpy.spin_once(node, timeout_sec=600.0)
     print('30 steps')
-    rclpy.spin(node)
+    spin_to_the_end(node)
 
 
 def calls_a_service():
@@ -106,35 +118,117 @@ def calls_a_service():
     print(f'answer: {future.result().message}')
 
 
-def catches_signals():
-    rclpy.init()
-    signal.signal(signal.SIGTERM, lambda *_: None)
-    signal.signal(signal.SIGHUP, lambda *_: print('read the settings again'))
-    os.kill(os.getpid(), signal.SIGHUP)
-    rclpy.spin(Listener('catcher'))
+def after(seconds, number):
+    """Send a signal to this process after a while."""
+    threading.Timer(seconds, os.kill, (os.getpid(), number)).start()
 
 
-def handles_a_signal():
+def handles_signals():
     def timed_out(number, frame):
-        raise TimeoutError(f'signal {number}')
+        raise TimeoutError(f'signal {number:d}')
 
     rclpy.init()
     node = Listener('handler')
-    before = signal.getsignal(signal.SIGUSR1)
-    signal.signal(signal.SIGUSR1, timed_out)
+    node.create_timer(0.02, lambda: None)  # with rclpy's executor a handler waits for a callback
+    before = signal.signal(signal.SIGUSR1, timed_out)
+    after(0.2, signal.SIGUSR1)
     try:
-        os.kill(os.getpid(), signal.SIGUSR1)
         while True:
             time.sleep(0.01)
     except TimeoutError as error:
         print(f'while it worked: {error}')
-    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGUSR1)).start()
+    after(0.2, signal.SIGUSR1)
     try:
         rclpy.spin(node)
     except TimeoutError as error:
         print(f'while it spun: {error}')
     print(f'one handler: {signal.signal(signal.SIGUSR1, before) is timed_out}')
-    rclpy.spin(node)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        future = rclpy.Future()
+        signal.signal(number, lambda *_, future=future: future.set_result(1))
+        after(0.1, number)
+        rclpy.spin_until_future_complete(node, future)
+        print(f'its own handler of {number.name}, ok: {rclpy.ok()}')
+    return 3
+
+
+def stops_the_robot():
+    """Send a last message, as drivers do: rclpy leaves Ctrl-C to Python."""
+    rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    node = Node('driver')
+    publisher = node.create_publisher(String, 'command', 10)
+    node.create_timer(0.02, lambda: None)
+    after(0.3, signal.SIGINT)
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        publisher.publish(String(data='stop'))
+        print(f'stopped the robot, ok: {rclpy.ok()}')
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def is_interrupted():
+    rclpy.init()
+    node = Node('interrupted')
+    after(0.3, signal.SIGINT)
+    try:
+        rclpy.spin(node)
+        print('spin returned')
+    except KeyboardInterrupt:
+        while rclpy.ok():  # rclpy's thread ends it at about the same time
+            time.sleep(0.01)
+        print('interrupted')
+        raise
+
+
+def works_with_asyncio():
+    async def run():
+        stop = asyncio.Event()
+        asyncio.get_running_loop().add_signal_handler(signal.SIGINT, stop.set)
+        rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+        node = Node('server')
+        node.create_timer(0.02, lambda: None)
+        after(0.2, signal.SIGINT)
+        while not stop.is_set():
+            rclpy.spin_once(node, timeout_sec=0.01)
+            await asyncio.sleep(0.01)
+        print(f'served, ok: {rclpy.ok()}')
+        asyncio.get_running_loop().remove_signal_handler(signal.SIGINT)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        return node
+
+    async def work():
+        after(0.2, signal.SIGINT)
+        try:
+            await asyncio.sleep(60.0)
+        except asyncio.CancelledError:
+            print('cancelled')
+            raise
+
+    node = asyncio.run(run())
+    try:
+        asyncio.run(work())
+    except KeyboardInterrupt:
+        print('interrupted')
+    after(0.2, signal.SIGINT)
+    try:
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        print('interrupted again')
+    sys.exit('no more work')
+
+
+def fails_at_the_end():
+    rclpy.init()
+    rclpy.spin_once(Node('failing'), timeout_sec=0.1)
+    rclpy.shutdown()
+    raise ValueError('not calibrated')
+
+
+def exits_early():
+    sys.exit(5)
 
 
 def handles_its_exceptions():
@@ -157,7 +251,7 @@ def handles_its_exceptions():
             except ValueError as error:
                 print(f'{name} raised {error}')
     timer.cancel()
-    rclpy.spin(node)
+    spin_to_the_end(node)
 
 
 def spins_in_callbacks():
@@ -184,7 +278,7 @@ def spins_in_callbacks():
             print(f'{way} {future.result().message}')
 
     timer = node.create_timer(0.1, tick, callback_group=group)
-    rclpy.spin(node)
+    spin_to_the_end(node)
 
 
 class PassesOn:
@@ -258,7 +352,7 @@ def after_a_while(callback, seconds=0.2):
     rclpy.init()
     node = Node('ending')
     node.create_timer(seconds, callback)
-    rclpy.spin(node)
+    spin_to_the_end(node)
 
 
 def finishes_its_callbacks():
@@ -279,7 +373,10 @@ def finishes_its_callbacks():
     timer = node.create_timer(0.01, loop, callback_group=group)
     executor = MultiThreadedExecutor()
     executor.add_node(node)
-    executor.spin()
+    try:
+        executor.spin()
+    except KeyboardInterrupt:
+        pass
 
 
 def shuts_down_in_one_of_two_callbacks():
@@ -391,10 +488,6 @@ def waits_for_a_task():
 
 
 # --- what cannot start ---------------------------------------------------------------------------
-
-
-def exits():
-    raise SystemExit(3)
 
 
 def own_context():

@@ -1,0 +1,206 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Signals that end a run, and the main thread that belongs to a program.
+
+Theory of operation
+-------------------
+1.  SIGINT, SIGTERM and SIGHUP end a run.  Their handler runs in the main thread.
+2.  While the main thread runs a program, Python's handler of SIGINT is its own one again, which
+    raises KeyboardInterrupt in the program, and the program may set handlers of its own and call
+    ``loop.add_signal_handler``: all that is as without this package.  rclpy's handlers are in C,
+    and run before those of Python.  In their place, Python's wake-up descriptor tells a thread
+    about each signal, and the thread ends the run if rclpy would have shut the context down
+    (``ends_run``).
+3.  A program may take the wake-up descriptor (as asyncio's loops do).  Then its spin reports the
+    KeyboardInterrupt that it gets (``interrupted``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+import os
+import select
+import signal
+import threading
+import time
+from types import FrameType
+from typing import Any, Protocol
+
+SAME_SIGNAL_S = 1.0
+"""Signals within this time are one: `timeout` sends one to the process, and one to its group."""
+_NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class Ended(Protocol):
+    """What signals end."""
+
+    @property
+    def stopped(self) -> bool:
+        """Return whether it is to end."""
+
+    def stop(self) -> None:
+        """End it."""
+
+    def hurry(self) -> None:
+        """Wait no longer for what still runs at the end."""
+
+
+class Signals:
+    """
+    Let SIGINT, SIGTERM and SIGHUP end a run, and its report be written; a context manager.
+
+    A SIGINT that comes while a run ends, but not together with the first, interrupts what still
+    runs; the next one interrupts the end itself.
+
+    :ivar ends_run: whether SIGINT, or a signal that a program handles, ends the run.
+    :ivar wake: called after each signal, without a lock.
+    """
+
+    def __init__(self) -> None:
+        self.ends_run: Callable[[int], bool] = lambda number: True
+        self.wake: Callable[[], None] = lambda: None
+        self._session: Ended | None = None
+        self._last: float | None = None  # when one came that counts
+        self._hurried = False
+        self._found: dict[int, Any] = {}
+        self._before: dict[int, Any] = {}
+        # reentrant: a handler may interrupt its owner
+        self._lock = threading.RLock()
+        self._pipe: tuple[int, int] | None = None
+
+    def __enter__(self) -> Signals:
+        """Note the handlers: those that a module sets while it is imported stay."""
+        self._found = {number: signal.getsignal(number) for number in _NUMBERS}
+        return self
+
+    def end_of(self, session: Ended) -> None:
+        """From now on they end this session."""
+        self._session = session
+        if threading.current_thread() is threading.main_thread():
+            for number in _NUMBERS:
+                now = signal.getsignal(number)
+                if now == self._found[number] and (
+                        number != signal.SIGHUP or now != signal.SIG_IGN):  # nohup
+                    self._before[number] = signal.signal(number, self._handle)
+
+    def __exit__(self, *args: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+        for number in self._before if self._last is not None else ():
+            # The process is about to end by itself; it is not to look as if it was killed.
+            signal.signal(number, signal.SIG_IGN)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self._is_third(number):
+            signal.default_int_handler(number, frame)
+        self.received(number, number != signal.SIGINT)
+        self.wake()
+
+    def _is_third(self, number: int) -> bool:
+        return (number == signal.SIGINT and self._hurried and self._last is not None
+                and time.monotonic() - self._last > SAME_SIGNAL_S)
+
+    def received(self, number: int, ends: bool = False) -> None:
+        """
+        Note a signal.
+
+        :param ends: it ends the run, whatever programs do with it.
+        """
+        now, session = time.monotonic(), self._session
+        with self._lock:
+            if session is None:
+                self._last = now
+            elif not session.stopped:
+                if ends or self.ends_run(number):
+                    self._last = now
+                    session.stop()
+            elif number == signal.SIGINT and (
+                    self._last is None or now - self._last > SAME_SIGNAL_S):
+                self._last, self._hurried = now, True
+                session.hurry()
+
+    # --- a program in the main thread ------------------------------------------------------------
+
+    @contextmanager
+    def of_program(self) -> Iterator[None]:
+        """Let the main thread belong to a program while entered."""
+        self._pipe = pipe = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        _given.append(pipe)
+        thread = threading.Thread(target=self._read, args=(pipe,), name='mddag-signals',
+                                  daemon=True)
+        thread.start()
+        signal.set_wakeup_fd(pipe[1], warn_on_full_buffer=False)
+        try:
+            if signal.SIGINT in self._before:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
+            yield
+        finally:
+            self.take_back()
+            _given.remove(pipe)
+            os.write(pipe[1], b'\0')  # the thread ends, and closes the pipe
+
+    def take_back(self) -> None:
+        """Let SIGINT raise nothing in the main thread any more; may be called again."""
+        if signal.SIGINT in self._before:
+            signal.signal(signal.SIGINT, self._handle)
+        self._pipe = None
+        signal.set_wakeup_fd(-1)
+
+    def _read(self, pipe: tuple[int, int]) -> None:
+        """Handle signals that Python has received, until a zero comes."""
+        while select.select([pipe[0]], [], []):
+            with self._lock:
+                if self._drain(pipe):
+                    break
+            self.wake()  # Python may run the handler only now
+        for fd in pipe:
+            os.close(fd)
+
+    def _drain(self, pipe: tuple[int, int]) -> bool:
+        """Handle the signals in the pipe; return whether there is a zero, which ends it."""
+        with suppress(BlockingIOError):
+            while numbers := os.read(pipe[0], 64):
+                for number in numbers:
+                    # others have their handlers, which do it
+                    if number == signal.SIGINT or number in self._before and (
+                            signal.getsignal(number) != self._handle):
+                        self.received(number)
+                if 0 in numbers:
+                    return True
+        return False
+
+    def interrupted(self) -> None:
+        """Note now that the program in the main thread, which calls this, has been interrupted."""
+        pipe = self._pipe
+        if pipe is None:
+            return
+        other = signal.set_wakeup_fd(pipe[1], warn_on_full_buffer=False)
+        if other == pipe[1]:
+            with self._lock:
+                self._drain(pipe)
+        else:
+            if other >= 0:
+                signal.set_wakeup_fd(other, warn_on_full_buffer=False)
+            self.received(signal.SIGINT)
+
+    def interrupt(self) -> None:
+        """Raise KeyboardInterrupt in the program in the main thread, if Python's handler does."""
+        if self._pipe is not None and (
+                signal.getsignal(signal.SIGINT) is signal.default_int_handler):
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+
+_given: list[tuple[int, int]] = []
+"""The pipes of programs that have the main thread."""
+
+
+def _forget_in_child() -> None:
+    """Let a forked child not tell its parent about its own signals."""
+    if _given:
+        with suppress(ValueError):  # another thread than the main one has forked
+            signal.set_wakeup_fd(-1)
+
+
+os.register_at_fork(after_in_child=_forget_in_child)
