@@ -68,8 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'empty callbacks of many topics; entities: one active topic next to idle subscriptions; '
         'robot: the ordinary nodes of examples/robot')
     add('--executors', default=','.join(EXECUTORS), metavar='E[,E…]',
-        help=f'some of {", ".join(EXECUTORS)}; the first is this one, also with another policy as '
-        'rad:fifo (default: all); and none: what the nodes of a declaration cost without an '
+        help=f'some of {", ".join(EXECUTORS)}; the first is this one, which takes another policy '
+        'as rad:fifo (default: all); and none: what the nodes of a declaration cost without an '
         'executor')
     add('--policies', metavar='P[,P…]',
         help=f'run this executor with each of these: {", ".join(POLICIES)} (default: rad)')
@@ -275,7 +275,8 @@ def notes(results: Sequence[dict[str, Any]]) -> Iterator[str]:
            + counted(first['workers'], 'worker')
            + (', published together' if first.get('phases') == 'together' else ''))
     if first['load'] == ROBOT:
-        yield "in time: by the nodes' own stamps, of what was due; cores: CPU of the whole process"
+        yield ("in time: by the nodes' own stamps, of the results that were due; cores: CPU of "
+               'the whole process')
     elif first['load'] in DECLARED:
         yield ('in time: of the results that were due, noticed by the executor or not; CPU: of '
                'the whole process')

@@ -91,7 +91,7 @@ class PublisherProcess:
 def _run(
     topics: Sequence[str], rate_hz: float, seed: int | None, orders: Connection
 ) -> None:
-    """Publish as ordered; the end of the ordering process is an order, too."""
+    """Publish as ordered; the end of the ordering process also is an order."""
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = quiet_node('/mddag_bench_publisher')
     publishers = [node.create_publisher(Header, topic, QOS) for topic in topics]

@@ -74,8 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--bodies', choices=('sleep', 'spin', 'native', 'mixed'), default='sleep',
         help='with --accuracy: how the callbacks of the live runs execute (default: sleep)')
     add('--utilisation', type=options.list_of(options.positive_float), metavar='U[,U…]',
-        help='with --accuracy: of the live runs (default: 0.3,0.6,0.8 for callbacks that sleep, '
-        'else 0.05,0.08)')
+        help='with --accuracy: utilisation of the live runs (default: 0.3,0.6,0.8 for callbacks '
+        'that sleep, else 0.05,0.08)')
     add('--seconds', type=options.positive_float, default=30.0, metavar='S',
         help='with --accuracy: how long each live run is, after 2 s that are left out '
         '(default: 30)')

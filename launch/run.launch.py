@@ -8,8 +8,8 @@ Run nodes under the executor, as `mddag run` does.
 
 Each option of `mddag run` is an argument of its name; one that is empty is left out.
 `ros2 launch` ends when the run ends, with status 1 if the run failed or, with
-`fail_on_miss:=true`, missed more deadlines than it may. SIGINT and SIGTERM end the run, which then
-prints its verdict and completes its trace.
+`fail_on_miss:=true`, missed more deadlines than the declaration tolerates. SIGINT and SIGTERM end
+the run, which then prints its verdict and completes its trace.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ _ENDINGS = ('.mcap', '.db3')
 
 
 def check_replaced(path: str, *, recording: bool, overwrite: bool = False) -> None:
-    """Raise InputError if an output may not take the place of what is there (rule 1)."""
+    """Raise InputError if an output may not replace an existing file (rule 1)."""
     if overwrite or not holds_data(path):
         return
     if recording:

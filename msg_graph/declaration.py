@@ -71,7 +71,7 @@ def read_processes(top: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
                 did_you_mean(node, nodes, 'name a node of the declaration'), item=node)
         if other != process:
             raise declared.error(
-                process, f'node {shown(node)} is in process {shown(other)}, too',
+                process, f'node {shown(node)} is also in process {shown(other)}',
                 'remove one of them: a node runs in one process', item=node)
 
     found = Collector()

@@ -9,7 +9,7 @@ Theory of operation
 2. In the text only the values of ``deadline:`` change; a callback without one gets a new line, or
    a new entry in its braces.  New ``processes:`` are the last entry.  Comments outside of it,
    order and layout stay.
-3. The new text must give the task set with only that change; otherwise it is refused.  (A value
+3. The new text must give the task set with only that change; else an error is raised.  (A value
    may be an alias of another one.)
 """
 
@@ -50,7 +50,7 @@ def without_lines(task_set: TaskSet) -> TaskSet:
 
 
 def _refused(name: str) -> GraphError:
-    return GraphError(name, None, 'it cannot be changed without a change of its meaning',
+    return GraphError(name, None, 'the file cannot be edited automatically',
                       'write anchors, quotes and multi-line texts more plainly')
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Ruff and mypy, and what they leave out: headers and dependencies."""
+"""Ruff and mypy, and what they do not check: English, headers and dependencies."""
 
 import ast
 from pathlib import Path
@@ -11,6 +11,9 @@ import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
+
+from . import english
+from .doc_blocks import pages
 
 pytestmark = pytest.mark.linter
 
@@ -58,6 +61,33 @@ def test_ruff():
 @pytest.mark.timeout(900)  # minutes on a busy machine, without what earlier runs have found
 def test_mypy():
     run('mypy')
+
+
+# Being rebuilt: their prose is checked when that is done.
+UNCHECKED_ENGLISH = (
+    'README.md', 'docs/', 'CHANGELOG.md',
+    'mddag_executor/cli/run.py', 'mddag_executor/core/', 'mddag_executor/executor/',
+    'mddag_executor/hosting/', 'mddag_executor/recording/', 'mddag_executor/replay/', 'test/')
+
+
+def test_english():
+    paths = [*(TOP / page for page in pages()), *SOURCES]
+    found = [line for path in paths
+             if not path.relative_to(TOP).as_posix().startswith(UNCHECKED_ENGLISH)
+             for line in english.findings(path)]
+    if found:
+        pytest.fail('\n'.join(found), pytrace=False)
+
+
+@pytest.mark.parametrize('pattern', english.PATTERNS, ids=lambda pattern: pattern.remedy[:30])
+def test_english_patterns_find_their_examples(pattern, tmp_path):
+    text = pattern.example.replace('`', '')
+    assert re.search(pattern.regex, text), pattern
+    page, module = tmp_path / 'page.md', tmp_path / 'module.py'
+    page.write_text(f'# Title\n\n* {text}\n\n```text\n{text}\n```\n', encoding='utf-8')
+    module.write_text(f'"""{text}"""\n# {text}\n', encoding='utf-8')
+    assert len(english.findings(page, tmp_path)) == 1
+    assert len(english.findings(module, tmp_path)) == 2
 
 
 def test_copyright():

@@ -5,7 +5,7 @@ Eight ordinary nodes: each sink takes times of its own, to compare them with the
 
     python examples/ordinary_robot/robot.py
 
-The detector publishes an alarm only when it sees somebody, and needs 150 ms for every second one,
+The detector publishes an alarm only when it sees a person, and needs 150 ms for every second one,
 so that the brake is late.  A timer fires once, a button is pressed now and then, and the planner
 only stores what the IMU measures.
 """
@@ -50,7 +50,7 @@ class Source(Part):
 
 
 class Detector(Part):
-    """See somebody in every third image."""
+    """See a person in every third image."""
 
     def __init__(self) -> None:
         super().__init__('detector')

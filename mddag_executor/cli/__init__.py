@@ -13,7 +13,7 @@ A verb's module is imported only when its verb is run, and has these names:
 | `main(args) -> int` | does the work and returns the exit status (0, or 1 for `--fail-on-miss`) |
 
 A verb reports bad input by raising an error of `mddag_executor.errors` or `msg_graph`;
-`main.py` turns it into one line on standard error and exit status 2. What the verbs share is in
+`main.py` turns it into one line on standard error and exit status 2. The verbs share
 `options.py` (arguments), `common.py` (files), `recorded.py` (recordings) and `text.py` (tables,
 warnings, progress).
 """

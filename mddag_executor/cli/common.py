@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Files of the verbs: reading files and standard input, and writing results (see `options`, too).
+Files of the verbs: reading files and standard input, and writing results (see also `options`).
 
 `check_output` is called before long work starts, so a mistyped path costs nothing.
 """
@@ -146,13 +146,13 @@ def check_files(args: argparse.Namespace) -> None:
         same = sorted(name for name, each in _files(args)
                       if isinstance(each, kind) and each == '-')
         if len(same) > 1:
-            raise UsageError(f'-: standard {stream} can be only one of {" and ".join(same)}: '
-                             'name a file for each other one')
+            raise UsageError(f'-: {" and ".join(same)} cannot all be standard {stream}: '
+                             'name a file for all but one')
     check_distinct(*([(name, each) for name, each in _files(args)
                       if isinstance(each, kind) and each != '-'] for kind in (Input, Output)))
     for name, each in _files(args):
         if isinstance(each, NamedFile) and each == '-':
-            raise UsageError(f'--{name} -: it is not written to standard output: name a file')
+            raise UsageError(f'--{name} -: it cannot be written to standard output: name a file')
         if isinstance(each, Output) and each.checked_early:
             check_output(each, each.is_recording, getattr(args, 'overwrite', False))
         if isinstance(each, Report):

@@ -31,14 +31,14 @@ exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad inp
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('first', metavar='A.mcap', type=options.Input,
-        help="the run to compare with: a trace, also an imported one ('-': standard input), or a "
+        help="the run to compare with: a trace, recorded or imported ('-': standard input), or a "
         'folder with the traces of all its processes')
     add('second', metavar='B.mcap', type=options.Input,
         help="the run to compare, likewise ('-': standard input)")
     add('graph', metavar='GRAPH', nargs='?', type=options.Input,
         help="the declaration that judges both ('-': standard input; default: each by the one "
         "that it was recorded with, an imported one by the other's)")
-    add('--callbacks', action='store_true', help='show a table of all callbacks, too')
+    add('--callbacks', action='store_true', help='also show a table of all callbacks')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
         'p99 response time grew by more than the tolerance')

@@ -20,7 +20,7 @@ DESCRIPTION = """\
 Draw the DAGs of a declaration, each in a frame. Timers are ellipses, subscriptions rounded boxes,
 sync callbacks hexagons, services parallelograms. Sinks have a double border and their deadline.
 Solid arrows are trigger edges with their topics (tool tips in graphs of more than 30 callbacks).
-Dotted arrows are queue edges; they begin at the name of what is read and of its writer. The colour
+Dotted arrows are queue edges; they begin at the name of the data and of its writer. The colour
 is the RAD offset: the time from the release of a job to the earliest deadline that a callback
 leads to; red is the most urgent. DAGs are in the order of the file, many of them in a grid.
 
@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     ending = Path(args.output).suffix.lower()
     if ending not in _ENDINGS:
         raise UsageError(
-            f'{args.output}: no ending that says what to draw: use one of {", ".join(_ENDINGS)}')
+            f'{args.output}: unsupported file extension: use one of {", ".join(_ENDINGS)}')
     program = _find_dot(args.output) if ending in _BY_GRAPHVIZ else ''
     task_set = common.load_graph(args.graph)
     from mddag_executor.report.picture import picture

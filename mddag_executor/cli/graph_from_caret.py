@@ -16,8 +16,8 @@ mddag graph check graph.yaml
 """
 DESCRIPTION = """\
 Make a declaration from a CARET architecture file: nodes, callbacks, timers, topics, callback
-groups, variable passings, message contexts and named paths. What such a file cannot know
-(deadlines, rates from outside, which callback publishes) is in comments marked 'FILL IN', with a
+groups, variable passings, message contexts and named paths. Facts that such a file lacks
+(deadlines, rates from outside, which callback publishes) are in comments marked 'FILL IN', with a
 proposal; remove the first '# ' of such a line once its value is right. With a recording of
 the same system (--trace) the rates of sources are proposed from it, the quantiles of the measured
 execution times (0, 50, 90, 99, 100 %) are filled in, and the recorded publishers of a topic

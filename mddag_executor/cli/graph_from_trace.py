@@ -18,8 +18,8 @@ DESCRIPTION = """\
 Make a declaration from a recorded run: a trace of this executor, a CARET or ros2_tracing recording
 that was imported, or the folder of one. A trace shows the nodes, their timers, subscriptions and
 services, callback groups, what each callback published, and the quantiles of its execution time
-(0, 50, 90, 99, 100 %). What it cannot show (deadlines, periods of what comes from outside, queue
-edges) is in comments marked 'FILL IN', with a proposal from the recorded rates; remove the
+(0, 50, 90, 99, 100 %). Facts that it lacks (deadlines, periods of messages from outside, queue
+edges) are in comments marked 'FILL IN', with a proposal from the recorded rates; remove the
 first '# ' of such a line once its value is right. If the run was recorded with a declaration, its
 names, deadlines, queue edges and paths are kept. Services that every node has, such as those for
 parameters, are left out, and so are services and subscriptions from outside that never ran; the

@@ -160,7 +160,7 @@ def main(
 @contextmanager
 def _ending_signals() -> Iterator[list[int]]:
     """
-    Let SIGTERM and SIGHUP end a command as Ctrl-C does, so no incomplete file is left behind.
+    Let SIGTERM and SIGHUP end a command as Ctrl-C does, so no incomplete file remains.
 
     An ignored signal (`nohup`) stays ignored.  Yields a list that gets the number of the signal.
     """
@@ -239,12 +239,12 @@ def user_line(error: BaseException) -> str | None:
     if isinstance(error, OSError) and error.filename is not None:
         reason = error.strerror or type(error).__name__
         remedy = _REMEDIES.get(error.errno) or _REMEDIES.get(
-            type(error), 'check the path and what it lies on')
+            type(error), 'check the path and the disk')
         name = error.filename if error.filename2 is None else error.filename2
         place = name if isinstance(name, int) else os.fsdecode(name)
         return one_line(f'{place}: {reason[:1].lower()}{reason[1:]}: {remedy}')
     if isinstance(error, ModuleNotFoundError) and error.name in _ROS:
-        return (f'{error.name}: ROS 2 is not there: source the setup file of your ROS 2, '
+        return (f'{error.name}: ROS 2 was not found: source the setup file of your ROS 2, '
                 "or install 'mddag_executor[ros]' with pip")
     return None
 

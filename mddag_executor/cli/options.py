@@ -174,8 +174,8 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'help': 'CPUs that callbacks which compute share', 'otherwise': 'enough for all'},
     '--preemptive': {
         'action': argparse.BooleanOptionalAction,
-        'help': 'a more urgent callback takes the worker of a running one, or does not',
-        'otherwise': 'it does not'},
+        'help': 'let more urgent callbacks preempt running ones',
+        'otherwise': '--no-preemptive'},
     '--execution-times': {
         'metavar': 'FILE', 'type': Input,
         'help': 'JSON {"DAG": {"/node:callback": microseconds}} with fixed execution times, '
@@ -219,7 +219,7 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         "of RUN.NAME.mcap, or a trace) is ahead of the first trace's, for instance 2.5ms, or "
         '-2.5ms if it is behind', 'otherwise': 'estimated from messages in both directions'},
     '--overwrite': {
-        'action': 'store_true', 'help': 'replace a recording that is there already'},
+        'action': 'store_true', 'help': 'replace an existing recording'},
     '--ros-args': {
         'nargs': argparse.REMAINDER, 'metavar': '…',
         'help': 'pass the rest of the command line to rclpy.init, for instance -r from:=to'},

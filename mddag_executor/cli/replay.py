@@ -31,10 +31,10 @@ mddag replay run.mcap --fail-on-miss --junit junit.xml"""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     options.add_recording(
-        parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
-        'ordinary bag, a folder or a file')
+        parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule it can be "
+        'an ordinary bag, a folder or a file')
     recorded.add_arguments(parser)
-    add('--callbacks', action='store_true', help='show a table of all callbacks, too')
+    add('--callbacks', action='store_true', help='also show a table of all callbacks')
     options.add(parser, '--fail-on-miss')
     add('--github', action='store_true',
         help='print an annotation for GitHub Actions for each sink that missed more than that')

@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--seed',
                 help="seed of Python's and numpy's random numbers and of declared times")
     add('--all-clocks', action='store_true',
-        help='make steady and system clocks, and the functions of the module time, virtual, too')
+        help='also make steady and system clocks, and the functions of the module time, virtual')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -136,7 +136,7 @@ def _lines(
            + (f' ({printable(topics)})' if topics else '') + f', {result.digest}')
     if result.recorded_topics:
         same = len(result.recorded_topics) - len(result.recorded)
-        yield f'{counted(len(result.recorded_topics), "topic")} recorded, too, {same} the same'
+        yield f'{counted(len(result.recorded_topics), "topic")} also recorded, {same} the same'
     for difference in result.recorded:
         yield f'not as recorded: {printable(difference.line())}'
     if args.expect is not None and not values['differences']:

@@ -177,7 +177,7 @@ def search(
     def is_good(scale: float) -> bool:
         if scale < _LEAST_SCALE:
             raise UsageError(
-                '--target: every deadline is good enough: is there anything to execute?')
+                '--target: any deadline can be met, because all execution times are about zero')
         tried.append((scale, acceptance(scale, experiment.seed)))
         return tried[-1][1].interval[0] >= target
 

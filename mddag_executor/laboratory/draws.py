@@ -68,7 +68,7 @@ def _read_values(archive: Any, key: str, name: str) -> Times:
         values: Floats = archive[key].astype(np.float64)
     except (*_DAMAGED, OSError):
         values = np.empty(0)
-    # false for what is no number
+    # false for values that are no numbers
     if values.ndim != 1 or not values.size or not np.all((values >= 0) & (values < DAY)):
         raise InputError(
             name, f'the values of {key} are damaged, or no list of ns below one day', _REMEDY)
@@ -177,8 +177,8 @@ def _waiting(
     """
     Return how long a job can wait at most while no vertex of its longest path runs, ns.
 
-    All workers are busy then (Graham), with what is released within the duration. With callback
-    groups, processes or the interpreter's lock at least one is.
+    All workers are busy then (Graham), with work that is released within the duration. With
+    callback groups, processes or the interpreter's lock at least one is.
     """
     shared = bool(task_set.processes) or any(
         callback.group is not None or callback.holds_interpreter

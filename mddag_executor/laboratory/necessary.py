@@ -9,7 +9,7 @@ Theory of operation
    length of the longest path to it, on however many workers.
 2. *Utilisation*: more work than the workers can do piles up.
 3. *Demand bound*: with all first releases together and all later ones as early as they may come,
-   what has to be done in [0, t] is no more than m t. What has to be done is refined for each sink:
+   what has to be done in [0, t] is no more than m t. This amount is refined for each sink:
    a vertex counts by when it has to be done so that each sink after it can still be in time
    (``Task.latest``), not by the deadline of the whole DAG. (Baruah, Mok and Rosier, RTSS 1990, for
    one processor and sequential tasks.)  If U < m only a bounded number of t can fail; of those

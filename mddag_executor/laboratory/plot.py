@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 FORMATS = ('.png', '.svg', '.pdf')
 
-# Colours of Okabe and Ito, which the colour-blind can distinguish, too; each with its own marker.
+# Colours of Okabe and Ito, which colour-blind readers can distinguish; each with its own marker.
 _STYLES = (
     ('#0072B2', 'o'), ('#D55E00', 's'), ('#009E73', '^'), ('#CC79A7', 'D'), ('#E69F00', 'v'),
     ('#56B4E9', 'P'), ('#000000', 'X'),

@@ -36,7 +36,7 @@ def compare(
     Compare the results of two replays.
 
     :param tolerance: allowed growth of a p99 response time, as a share (0.1 is 10 %).
-    :param before: results of ``Replay`` or ``Reschedule``; ``after``, too.
+    :param before: results of ``Replay`` or ``Reschedule``, as is ``after``.
     :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null if missing),
         ``change_ns`` and ``change`` (share) of response times and ``worse``; ``callbacks`` with
         both sides' executions and mean times; ``worse`` of the whole; ``compared``, the number of

@@ -46,7 +46,7 @@ class ReportData(NamedTuple):
     :ivar replay: the run as it was recorded or computed.
     :ivar duration_ns: from the first release to the end of the run.
     :ivar causes: the cause of each miss, by global vertex of the sink and job.
-    :ivar behind: the callback that most delayed it, for misses that waited; also by sink and job.
+    :ivar behind: the callback that most delayed it, for misses that waited, by the same keys.
     :ivar worker_names: the names of workers, if they are more than a number.
     """
 

@@ -14,7 +14,7 @@ from mddag_executor.report.tables import percent, short_names, times
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
 
-_QUESTION = 'How many times as long each callback may take'
+_QUESTION = 'How much longer each callback may take'
 _MARGINS = 'sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'
 
 

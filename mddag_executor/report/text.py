@@ -30,7 +30,7 @@ def printable(text: str) -> str:
     Return a text with control characters written as escapes (`\x1b`).
 
     Names come from files; a terminal must never interpret them. Line breaks, changes of the
-    writing direction and lone surrogates are escaped, too. (``msg_graph.errors`` has a copy for
+    writing direction and lone surrogates are escaped as well. (``msg_graph.errors`` has a copy for
     its own errors; importing that one would load YAML for every `--help`.)
     """
     if text.isprintable():
@@ -86,7 +86,7 @@ def table(
     most: int | None = None, grouped: int = 0,
 ) -> str:
     """
-    Return an aligned table; columns of numbers (also with a unit) are right-aligned.
+    Return an aligned table; columns of numbers, with or without a unit, are right-aligned.
 
     Long names are shortened in their middle, so that the table is at most ``WIDTH`` columns wide,
     with few rows ``NARROW``.

@@ -64,8 +64,8 @@ def rerun(
     :param nodes: as for ``mddag run --node``; or classes of nodes, or functions that return nodes.
     :param times: ``recorded``, ``declared``, or a file (see ``inputs.open_input``).
     :param cpus: that callbacks which compute share; None: as many as are needed.
-    :param seed: of Python's ``random``, of numpy's legacy generator and of what is drawn.
-    :param all_clocks: whether steady and system clocks and Python's ``time`` are virtual, too.
+    :param seed: of Python's ``random``, of numpy's legacy generator and of drawn execution times.
+    :param all_clocks: whether steady and system clocks and Python's ``time`` are virtual as well.
     :param output: a file that gets the outputs as a bag; ``trace``: one that gets the run. A run
         that fails leaves no file.
     :param overwrite: whether ``output`` and ``trace`` may replace files that are there.

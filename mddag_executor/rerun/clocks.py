@@ -69,7 +69,7 @@ class VirtualTime:
     Puts virtual time in the place of the machine's.
 
     :cvar current: that of the current run.
-    :param all_clocks: whether steady and system clocks are virtual, too.
+    :param all_clocks: whether steady and system clocks are virtual as well.
     :param simulated: whether the recording has ``/clock``.
     """
 
@@ -92,7 +92,7 @@ class VirtualTime:
         replace(threading, '_allocate_lock', self._allocate_lock)  # for ``Condition.wait``
         replace(threading.Thread, 'start', self._thread_start)
         replace(threading.Thread, 'join', self._thread_join)
-        # The one in C waits without asking anybody; pools of threads are built on it.
+        # The one in C waits without asking the run; pools of threads are built on it.
         replace(queue, 'SimpleQueue', lambda original: vars(queue)['_PySimpleQueue'])
         replace(random.Random, 'seed', self._random_seed)
         # that of the module is a method of a generator, bound before

@@ -5,7 +5,7 @@ Whether two runs have published the same: message by message, field by field.
 
 Theory of operation
 -------------------
-The messages of a topic are compared one by one, in their order. What is reported of a topic is
+The messages of a topic are compared one by one, in their order. The report of a topic says
 where it differs first, and whether only in *timing*: the same messages, but at other times, or
 with other stamps in them (fields of type ``builtin_interfaces/Time``).
 
@@ -63,7 +63,7 @@ def differences(
     tolerance: float = 0.0,
 ) -> list[Difference]:
     """
-    Compare what was published with what is expected, topic by topic.
+    Compare the published messages with the expected ones, topic by topic.
 
     :param start: the virtual time at which the run began.
     """

@@ -9,8 +9,8 @@ A job takes the times of the job of a load with the nearest release, at most hal
 there is none, each vertex takes the median of its times.
 
 *Recorded*: the load is that of a recording, whose k-th job is not always the k-th of the rerun.
-The time from a vertex's end to the arrival of its message is the recorded one, too. Messages leave
-at the end, also if the recorded callback published earlier.
+The time from a vertex's end to the arrival of its message is also the recorded one. Messages leave
+at the end, even if the recorded callback published earlier.
 
 *Fixed* (declared, drawn, or from a file of execution times): each vertex takes the same time in
 every job. Its messages leave at its end and arrive at once.

@@ -13,18 +13,18 @@ time goes on.
 
 A callback runs, for real and at once, when the core dispatches it. In virtual time it takes as
 long as ``times`` says, on the CPUs and with the interpreter that it shares as in the simulator
-(``simulate.machine``), or as long as it has waited, if that is more. What it sends is kept until
-its virtual end, or until it begins to wait, because others may have to answer it.
+(``simulate.machine``), or as long as it has waited, if that is more. Its messages are kept until
+its virtual end, or until it begins to wait, because others may have to answer them.
 
 A message that another thread sends has no virtual time: it gets the time at which it arrives, and
 a warning says so.
 
 A recording may have pauses: the recorder was stopped, or the machine's clock set forward. No
-timer fires in a pause, and what has begun is completed, for ``DRAIN_NS`` at most. What else would
-happen in it happens at its end, a timer once.
+timer fires in a pause, and executions that have begun are completed, for ``DRAIN_NS``
+at most. Other events of the pause happen at its end, and a timer fires once.
 
-The run is over when nothing is left to happen, or at ``end``. Then, too, no timer fires any more,
-and what has begun is completed.
+The run is over when nothing is left to happen, or at ``end``. Then no timer fires any more,
+and executions that have begun are completed.
 """
 
 from __future__ import annotations

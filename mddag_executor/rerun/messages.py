@@ -10,9 +10,9 @@ which lets it *leave* later. Then it is an output of the run, and goes to all su
 topic whose QoS fits: each gets a message of its own, after the transport time.
 
 A recorded message goes to the subscriptions of its topic at its recorded time, unless a node of
-the run publishes on the topic: then the node's messages count. What is loaded of the recording are
-the topics that nodes subscribe to, and those that they publish, to be compared. If a node
-subscribes to another topic later, its messages are loaded then and arrive from then on. If a node
+the run publishes on the topic: then the node's messages count. Loaded from the recording are
+the topics that nodes subscribe to, and the topics that they publish, to be compared. If a node
+subscribes to another topic later, its later messages are loaded and arrive. If a node
 subscribes to ``/clock``, and it is neither recorded nor published by a node, it gives virtual
 time.
 

@@ -72,7 +72,8 @@ class Result:
     :ivar counts: how many messages were published, by topic.
     :ivar elapsed_s: how long it really took.
     :ivar start_ns: the virtual time at which it began.
-    :ivar recorded_topics: those that are in the recording, too; ``recorded``: how these differ.
+    :ivar recorded_topics: published topics that are also in the recording; ``recorded``: how these
+        differ.
     :ivar warnings: what is not the same in each run, or doubtful, one line each.
     """
 

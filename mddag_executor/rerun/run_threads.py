@@ -240,7 +240,7 @@ class RunThreads:
         :param patience_s: a run thread that waits for this long is stuck.
         :param progress: returns what changes as long as the run goes on.
         :param tick: called now and then.
-        :raises Stalled: if a run thread has stalled; its thread is left behind.
+        :raises Stalled: if a run thread has stalled; its thread is abandoned.
         :raises BaseException: what ended the run.
         """
         self._pass_on()
@@ -250,7 +250,7 @@ class RunThreads:
                 tick()
                 if self.over:
                     self._finished.wait(_END_S)
-                    break  # what has not ended is left behind
+                    break  # threads that have not ended are abandoned
                 watch.check()
         finally:
             self.over = True

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 1. The functions of the core and of the event loop are used unchanged: each is bound to a common
    namespace, in which the names of the others refer to their compiled versions, and the names of
-   ``heapq`` to those of ``vectors``.  So a name, also of a constant, must mean the same in all
+   ``heapq`` to those of ``vectors``.  So a name, even of a constant, must mean the same in all
    modules.  No rule exists twice.  Only ``add_queue`` is replaced, because an empty list has no
    type.  The policy is an additional field of the tables; the key function selects by it, so one
    compilation is enough for all policies.

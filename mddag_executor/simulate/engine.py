@@ -8,7 +8,7 @@ Theory of operation
 Time jumps from event to event; an event is the release of a job or the end of an execution.  At
 one instant first the completions are given to the core, workers in ascending order, then the
 releases in DAG order, then the core dispatches until nothing is left to do (design section 9). A
-completion at the horizon counts; nothing is released or dispatched from then on.
+completion at the horizon counts; after that nothing is released or dispatched.
 
 If transport takes time or executions fail, ``deliveries`` ends the executions, and the messages of
 an instant arrive between its completions and its releases.  If CPUs are limited or executions hold

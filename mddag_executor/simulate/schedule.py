@@ -44,7 +44,8 @@ class Settings:
     :ivar dispatch_overhead_ns: added to an execution at each dispatch; ``switch_overhead_ns``: at
         each preemption.
     :ivar cpus: shared by the executions that compute; None: enough for all.
-    :ivar judge_from: jobs released before are not judged; ``judge_until``: nor those from then on.
+    :ivar judge_from: jobs released before are not judged; ``judge_until``: nor those released
+        then or later.
     :ivar processes: number of processes, each with its own interpreter.
     :ivar on_late: handling of late jobs of a DAG that does not declare it.
     """

@@ -44,7 +44,7 @@ GROUPS = {
 
 
 def events_of(entry: Sequence[Any]) -> int:
-    """Return the number of events of an entry; 1 for what is none."""
+    """Return the number of events of an entry; 1 for other entries."""
     return next((len(events) for name, events in GROUPS.items() if entry[:1] == (name,)), 1)
 
 

@@ -169,17 +169,17 @@ class TraceReader:
         damage, summary = reading.damage, self._summary
         found = _contents(reading.chunks, reading.messages)
         stated = (f'the file says that it holds {_contents(summary.chunks, summary.messages)}'
-                  if summary else 'what there should be is not known')
+                  if summary else 'the file has no index, so the loss is unknown')
         if damage:
             lost = self._size - damage.offset
-            more = f', not the {lost} bytes from there on' if lost else ''
-            return (f'{self.path}: {damage.what} (at byte {damage.offset}): used {found} before '
+            more = f', ignored the last {lost} bytes' if lost else ''
+            return (f'{self.path}: {damage.what} (at byte {damage.offset}): read {found} before '
                     f'it{more}; {stated}')
         if not self._finished:
-            return (f'{self.path}: the summary at the end is damaged or missing: used all of the '
+            return (f'{self.path}: the summary at the end is damaged or missing: read all of the '
                     f'data, {found}')
         if summary and (summary.chunks, summary.messages) != (reading.chunks, reading.messages):
-            return f'{self.path}: events are missing or doubled: used {found}; {stated}'
+            return f'{self.path}: events are missing or doubled: read {found}; {stated}'
         return None
 
 
@@ -191,7 +191,7 @@ def read_events(path: str | os.PathLike[str],
     CARET's analysis fails on unknown events; ``names`` selects the wanted ones.
 
     Each event is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`,
-    `_vtid` and the event's fields in the file. In an imported recording it has `_procname`, too:
+    `_vtid` and the event's fields in the file. In an imported recording it also has `_procname`:
     the events `mddag:process` that hold it are only yielded if they are named. A `TraceWarning` at
     the end reports missing data.
 

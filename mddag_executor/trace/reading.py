@@ -16,7 +16,7 @@ Theory of operation
    recording is used.  ``damage`` has the damage; it is not raised.  If the records of a block are
    wrong, those before it are used, unless the block is a chunk without CRC.
 5. An undecodable message in a valid block is skipped and counted.  In the order of time, events
-   before 1970 or after 2116 are skipped, too: a simulation of them would never end.
+   before 1970 or after 2116 are skipped as well: a simulation of them would never end.
 6. If messages of some topics are wanted, a chunk is only unpacked if its message indexes name one
    of these, or a channel that the summary does not have.  Its times are then those of the indexes.
 """
@@ -223,7 +223,7 @@ class Reading:
         Those of messages before the first wrong record, which is also returned.
         """
         at, lengths, channels = _indexed(data, indexes)
-        # definitions are between the messages; without usable indexes all messages are, too
+        # definitions are between the messages; without usable indexes, so are all messages
         ends, begins = np.append(0, at + _CONTENT + lengths), np.append(at, len(data))
         gaps = np.flatnonzero(ends < begins)
         found: list[Ints] = []

@@ -9,7 +9,7 @@ Theory of operation:
    CPython: no lock, no waiting. If the deque is full, the event is counted as lost.
 2. The writer thread empties the deque every `flush_interval_s` and passes whole chunks to the
    operating system, so a killed process loses little more than that.
-3. Encoding needs the GIL, which the workers need, too: the thread encodes a small slice of events,
+3. Encoding needs the GIL, which the workers also need: the thread encodes a small slice of events,
    then sleeps, so no worker waits for more than one slice. If it falls behind, it does not sleep.
 4. Losses are written into the trace as `mddag:lost` for readers.
 5. If writing fails, recording ends and the run continues; `error` has the reason, and `close()`

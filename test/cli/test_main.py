@@ -65,7 +65,7 @@ def fail_with(error):
     (OSError(24, 'Too many open files'),
      "this process: too many open files: allow more with 'ulimit -n'"),
     (OSError(5, 'Input/output error', 'out.json'),
-     'out.json: input/output error: check the path and what it lies on'),
+     'out.json: input/output error: check the path and the disk'),
 ])
 def test_bad_input_is_one_line(verb, capsys, error, line):
     verb(fail_with(error))

@@ -92,27 +92,27 @@ def test_warnings_have_counts(tmp_path, sample):
     unread = len(data) - chunk[0]
     path.write_bytes(data[:chunk[0] + 20])
     assert read(path)[1] == [
-        f'{path}: a record is cut off, or its length is wrong (at byte {chunk[0]}): used 2 chunks '
-        'with 7 messages before it, not the 20 bytes from there on; what there should be is not '
-        'known']
+        f'{path}: a record is cut off, or its length is wrong (at byte {chunk[0]}): read 2 chunks '
+        'with 7 messages before it, ignored the last 20 bytes; the file has no index, so the loss '
+        'is unknown']
     changed = bytearray(data)
     changed[chunk[1] - 10] ^= 1
     path.write_bytes(changed)
     text = read(path)[1][0]
-    assert f': used 2 chunks with 7 messages before it, not the {unread} bytes from there on; ' \
+    assert f': read 2 chunks with 7 messages before it, ignored the last {unread} bytes; ' \
            'the file says that it holds 4 chunks with 14 messages' in text
     path.write_bytes(data[:spans(data)[2][0]])
     assert read(path)[1] == [
-        f'{path}: the file ends without a finish record (at byte {chunk[0]}): used 2 chunks with '
-        '7 messages before it; what there should be is not known']
+        f'{path}: the file ends without a finish record (at byte {chunk[0]}): read 2 chunks with '
+        '7 messages before it; the file has no index, so the loss is unknown']
     begin, end = spans(data)[3]
     padding = struct.pack('<BQ', 0x90, end - begin - 9) + bytes(end - begin - 9)
     path.write_bytes(data[:begin] + padding + data[end:])
     assert read(path)[1] == [
-        f'{path}: events are missing or doubled: used 3 chunks with 8 messages; the file says '
+        f'{path}: events are missing or doubled: read 3 chunks with 8 messages; the file says '
         'that it holds 4 chunks with 14 messages']
     path.write_bytes(data[:-1])
-    assert read(path)[1] == [f'{path}: the summary at the end is damaged or missing: used all of '
+    assert read(path)[1] == [f'{path}: the summary at the end is damaged or missing: read all of '
                              'the data, 4 chunks with 14 messages']
 
 
@@ -393,7 +393,7 @@ def test_two_files_in_one(tmp_path, sample):
     (tmp_path / 'a.mcap').write_bytes(data * 2)
     events, (warning,) = read(tmp_path / 'a.mcap')
     assert events == [event for chunk in chunks for event in chunk]
-    assert f'another one had been appended to it (at byte {len(data)}): used 4 chunks' in warning
+    assert f'another one had been appended to it (at byte {len(data)}): read 4 chunks' in warning
 
 
 SPARSE = """
@@ -414,7 +414,7 @@ def test_a_damaged_footer_is_not_believed(tmp_path, sample):
         file.seek(0, os.SEEK_END)
         file.write(records.record(Opcode.FOOTER, struct.pack('<QQI', 40, 0, 1)) + records.MAGIC)
     text = run_program(SPARSE, path)[0]
-    assert text.startswith('14 ') and 'used 4 chunks' in text
+    assert text.startswith('14 ') and 'read 4 chunks' in text
 
 
 @pytest.mark.parametrize(('data', 'says'), [

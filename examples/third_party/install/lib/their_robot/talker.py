@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""A node as anybody writes it; it knows nothing of this executor."""
+"""An ordinary node; it knows nothing of this executor."""
 
 import rclpy
 from rclpy.executors import ExternalShutdownException
