@@ -197,6 +197,23 @@ def is_quick(callback: Any) -> bool:
     return code is _FORGET or code is not None and code is _UNBLOCK
 
 
+class QuickCallback:
+    """
+    A future's done callback that takes no time, and never fails.
+
+    A future passes its callbacks to its executor as tasks; this one is called at once instead.
+    """
+
+    __slots__ = ('_function',)
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._function = function
+
+    def __call__(self, _: Any = None) -> None:
+        """Call the function."""
+        self._function()
+
+
 _NUMBERS = {
     'goal': '_goal_sequence_number_to_goal_id', 'cancel': '_pending_cancel_requests',
     'result': '_pending_result_requests'}
@@ -292,18 +309,7 @@ _TASK_CODE = Task.__call__.__code__.co_filename
 
 
 class BareTask(Task):
-    """
-    A task that does not continue by itself when the future it waits for is done.
-
-    :ivar waits_for: the future that its coroutine waits for, if rclpy reports it (7.1.9).
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.waits_for: Future | None = None
-        super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
-
-    def _add_resume_callback(self, future: Future, executor: Any) -> None:
-        self.waits_for = future
+    """A task whose coroutine always yields None: the executor knows when it goes on."""
 
     def unfetched(self) -> BaseException | None:
         """Return the task's exception, unless it has been fetched (``exception``)."""
@@ -313,6 +319,13 @@ class BareTask(Task):
     def mark_fetched(self) -> None:
         """Mark the task's exception as handled: otherwise it is printed."""
         self._exception_fetched = True
+
+
+def cancel_running(task: Any) -> None:
+    """Cancel a task whose coroutine has ended with CancelledError; rclpy would not."""
+    task._executing = False
+    task._complete_task()
+    Future.cancel(task)
 
 
 def function_of_task(callback: Any, args: tuple[Any, ...]) -> object:
@@ -362,7 +375,7 @@ def awaited(coroutine: Any) -> Any:
     """
     Return the rclpy future that a suspended coroutine waits for, or NEXT_TURN.
 
-    From 7.1.9 on, the coroutine reports it. In 7.1.5 and 9.1 ``Future.__await__`` is a generator
+    From 7.1.9 on, the coroutine yields it. In 7.1.5 and 9.1 ``Future.__await__`` is a generator
     that yields nothing. So the future is looked up at the end of the chain of awaits.
     """
     inner = coroutine

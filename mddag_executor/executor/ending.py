@@ -91,6 +91,7 @@ class Ending:
         if self.announcements is not None:
             self.announcements.close()
         pool = self._pool
+        pool.end_coroutines()
         with pool.lock:
             now = pool.tick()
             end = min(now, pool.stopped_at or now)

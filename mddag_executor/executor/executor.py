@@ -37,6 +37,7 @@ from mddag_executor.executor.compat import (
     BareExecutor,
     is_called_by_spin,
     is_quick,
+    QuickCallback,
     RCL_ERRORS,
     TASKS_NEWEST_FIRST,
 )
@@ -61,7 +62,7 @@ from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, wa
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.waitables import WaitSetThread
-from mddag_executor.executor.work import current, QuickCallback, Work
+from mddag_executor.executor.work import current, Work
 from mddag_executor.executor.workers import WorkerPool
 from msg_graph import TaskSet
 from rclpy.duration import Duration
@@ -70,6 +71,8 @@ from rclpy.executors import ExternalShutdownException, TimeoutObject
 from rclpy.task import Future, Task
 
 if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+
     from rclpy.context import Context
     from rclpy.node import Node
     from typing_extensions import Self
@@ -94,6 +97,12 @@ def deadline_of(timeout_sec: float | None) -> float | None:
     if math.isnan(timeout_sec):
         raise ValueError('timeout_sec is NaN: it must be a number of seconds, or None')
     return time.monotonic() + timeout_sec
+
+
+def _set_done(future: Any) -> None:
+    """Complete a future of asyncio."""
+    if not future.done():
+        future.set_result(None)
 
 
 class MultiDeadlineExecutor(BareExecutor):
@@ -323,7 +332,7 @@ class MultiDeadlineExecutor(BareExecutor):
             return task
         task, work = make_task(
             self._task_entities.of(callback, args), self, self._pool.resume, self._unclaimed,
-            callback, args, kwargs)
+            self._pool.loops, callback, args, kwargs)
         is_spinning = self._spinning.locked()
         if is_spinning:
             self._pool.report(self._engine.ready, work)
@@ -642,10 +651,6 @@ class MultiDeadlineExecutor(BareExecutor):
         :param done: whether to stop waiting.
         :return: whether a callback ran.
         """
-        if self._ending.stepping is None:
-            self._ending.stepping = select.epoll()
-            self._ending.stepping.register(self._pool.loop.fd, select.EPOLLIN)
-            self._ending.stepping.register(self._at_once.loop.fd, select.EPOLLIN)
         self._start_threads()
         if self._handle_once():
             return True
@@ -653,6 +658,14 @@ class MultiDeadlineExecutor(BareExecutor):
             return False
         self._wait_stepping(self._patience_s(deadline, self._upkeep.rest_s()))
         return self._handle_once()
+
+    def _stepping_epoll(self) -> select.epoll:
+        """Return the epoll in which a spin in the calling thread waits."""
+        if self._ending.stepping is None:
+            self._ending.stepping = select.epoll()
+            self._ending.stepping.register(self._pool.loop.fd, select.EPOLLIN)
+            self._ending.stepping.register(self._at_once.loop.fd, select.EPOLLIN)
+        return self._ending.stepping
 
     def _handle_once(self) -> bool:
         """Handle ready events; run one callback if there is one, and return whether one ran."""
@@ -664,13 +677,58 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _wait_stepping(self, left: float | None) -> None:
         """Wait for an arrival or a due time; at most ``left`` seconds, None: for ever."""
-        stepping = self._ending.stepping
-        assert stepping is not None
+        stepping = self._stepping_epoll()
         fd = stepping.fileno()
         if left is None or fd >= 1024:  # which ``select`` does not support
             stepping.poll(-1 if left is None else left)
         else:
             select.select([fd], [], [], left)  # resolution 1 us; that of an epoll is 1 ms
+
+    async def spin_async(self) -> None:
+        """
+        Run callbacks in the running event loop, one at a time, until shutdown.
+
+        Callbacks and other coroutines of the loop share its thread, so none of them may block.
+        Coroutines of callbacks use this loop.  If it is cancelled, the executor may spin again.
+
+        :raises ExternalShutdownException: when something else than a callback ends the context.
+        :raises RuntimeError: when the executor spins already.
+        :raises Exception: the exception of a callback.
+        """
+        import asyncio  # rclpy does without it
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        loop = asyncio.get_running_loop()
+        try:
+            with self._pool.stepping(), self._signals.watch():
+                while not self.is_ending() and not self._was_ended():
+                    self._raise_error()
+                    self._start_threads()
+                    ran = self._handle_once()
+                    self._raise_error()
+                    if ran:
+                        await asyncio.sleep(0)  # other coroutines of the loop
+                    elif not (self.is_ending() or is_over(self.context)):
+                        await self._readable(loop)
+        except RCL_ERRORS:
+            if not self._was_ended():
+                raise
+        finally:
+            self._end_spin()
+        self._raise_error()  # of the callback that has ended the context, raised after that
+
+    async def _readable(self, loop: AbstractEventLoop) -> None:
+        """Let the event loop run until there is an arrival or a due time."""
+        fd, event = self._stepping_epoll().fileno(), loop.create_future()
+        loop.add_reader(fd, _set_done, event)
+        left = self._patience_s(None, self._upkeep.rest_s())
+        timer = None if left is None else loop.call_later(left, _set_done, event)
+        try:
+            await event
+        finally:
+            loop.remove_reader(fd)
+            if timer is not None:
+                timer.cancel()
 
     # --- the end ---------------------------------------------------------------------------------
 

@@ -21,14 +21,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 import inspect
-from typing import Any
+from typing import Any, TYPE_CHECKING
 import weakref
 
 from mddag_executor.executor.bounds import REMEMBERED
-from mddag_executor.executor.compat import BareTask, forget_task_frames, function_of_task
+from mddag_executor.executor.compat import (
+    BareTask,
+    forget_task_frames,
+    function_of_task,
+    QuickCallback,
+)
 from mddag_executor.executor.entity import Entity, TASK
-from mddag_executor.executor.work import current, QuickCallback, TaskWork, Work
+from mddag_executor.executor.work import current, TaskWork, Work
 from rclpy.task import Future
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.coroutines import Loops
 
 CHECK_S = 0.05
 """How often to check whether a callback still runs that has created a failed task."""
@@ -191,23 +199,26 @@ class TaskEntities:
 
 def make_task(
     entity: Entity, executor: Any, resume: Callable[[TaskWork], None], unclaimed: Unclaimed,
-    callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any],
+    loops: Callable[[], Loops] | None, callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any],
 ) -> tuple[ObservedTask, TaskWork]:
     """
     Make a task of a function, a coroutine function or a coroutine, and the work that runs it.
 
     :param resume: makes the work ready again; called when the task is cancelled.
     :param unclaimed: receives the task with its exception when it has ended.
+    :param loops: returns the event loops of coroutines; None: there are none.
     """
-    coroutine = None
+    steps = None
     if inspect.iscoroutinefunction(callback):
         callback, args, kwargs = callback(*args, **kwargs), (), {}
     if inspect.iscoroutine(callback):
-        coroutine = callback
+        from mddag_executor.executor.coroutines import Steps  # with asyncio, when it is needed
+        steps = Steps(callback, None if loops is None else loops())
+        callback = steps.as_coroutine()
     task = ObservedTask(callback, args, kwargs, executor=executor)
     work = TaskWork(entity, task)
-    work.coroutine = coroutine
+    work.coroutine = steps
     work.then = unclaimed.ended
-    if coroutine is not None:
+    if steps is not None:
         Future.add_done_callback(task, QuickCallback(partial(resume, work)))  # not an observer
     return task, work

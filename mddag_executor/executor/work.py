@@ -25,7 +25,7 @@ import threading
 import types
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.executor.compat import awaited
+from mddag_executor.executor.compat import cancel_running
 from mddag_executor.executor.entity import Entity, TIMER
 from mddag_executor.executor.jobs import Origin
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -43,21 +43,17 @@ current = _Current()
 """Of the calling thread: ``running``, its ``WorkerThread`` while a callback runs in it."""
 
 
-class QuickCallback:
-    """
-    A future's done callback that takes no time, and never fails.
+def new_steps(coroutine: Any) -> Any:
+    """Return the steps of a coroutine that the calling thread's callback has returned."""
+    from mddag_executor.executor.coroutines import Steps  # with asyncio, when it is needed
+    running = current.running
+    return Steps(coroutine, None if running is None else running.pool.loops())
 
-    A future passes its callbacks to its executor as tasks; this one is called at once instead.
-    """
 
-    __slots__ = ('_function',)
-
-    def __init__(self, function: Callable[[], Any]) -> None:
-        self._function = function
-
-    def __call__(self, _: Any = None) -> None:
-        """Call the function."""
-        self._function()
+def is_cancelled(error: BaseException) -> bool:
+    """Return whether it is the exception that ends a cancelled coroutine."""
+    return type(error).__name__ == 'CancelledError' and type(error).__module__ == (
+        'asyncio.exceptions')
 
 
 class Destroyed(Exception):
@@ -80,6 +76,7 @@ class Work:
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: its CPU time.
+    :ivar coroutine: its ``coroutines.Steps``, if it is one and has begun.
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
@@ -116,14 +113,19 @@ class Work:
                 if self.then is not None:
                     self.then(result)
                 return None
-            self.coroutine = result
+            self.coroutine = new_steps(result)
+        steps = self.coroutine
         try:
-            yielded = self.coroutine.send(None)
+            steps.send()
         except StopIteration as stop:
             if self.then is not None:
                 self.then(stop.value)
             return None
-        return yielded if yielded is not None else awaited(self.coroutine)
+        except BaseException as error:
+            if not (is_cancelled(error) and steps.cancelling()):
+                raise
+            return None
+        return steps.waits_for
 
     def _check(self) -> None:
         entity = self.entity
@@ -150,15 +152,19 @@ class TaskWork(Work):
     def step(self, must_check: bool = True) -> Any:
         """Run the task once; return None when it is done."""
         task: Any = self.function
-        task.waits_for = None
-        task()
+        try:
+            task()
+        except BaseException as error:
+            if not is_cancelled(error):
+                raise
+            cancel_running(task)
         if task.done() or task.cancelled():
             self.function = _nothing  # other references to the task may remain: see ``tasks``
             if self.then is not None:
                 self.then(task)
             del task
             return None
-        return awaited(self.coroutine) if task.waits_for is None else task.waits_for
+        return self.coroutine.waits_for
 
 
 # --- callback groups of a user-defined class -----------------------------------------------------

@@ -59,7 +59,7 @@ from mddag_executor.executor.bounds import (
     REJOIN_NS,
     SHORT_CALLBACK_NS,
 )
-from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN
+from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN, QuickCallback
 from mddag_executor.executor.debugging import engine_lock
 from mddag_executor.executor.due import DueTimes, Guard, Muting
 from mddag_executor.executor.ending import weakly
@@ -70,11 +70,13 @@ from mddag_executor.executor.loop import EventLoop, Events
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
-from mddag_executor.executor.work import current, Destroyed, QuickCallback, Refused, Work
+from mddag_executor.executor.work import current, Destroyed, Refused, Work
 from mddag_executor.trace.groups import PUBLICATION
+from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
     from mddag_executor.executor.announcements import Announcements
+    from mddag_executor.executor.coroutines import Loops
     from mddag_executor.executor.executor import MultiDeadlineExecutor
 
 
@@ -214,6 +216,7 @@ class WorkerPool:
         self._is_stepping = False
         # coroutines that have yielded: they continue in the next step
         self._of_next_step: list[Work] = []
+        self._loops: Loops | None = None
         self.now = 0
         # the thread that last dispatched a short callback
         self._leader: WorkerThread | None = None
@@ -223,6 +226,20 @@ class WorkerPool:
         self.due = DueTimes(self)
         #: wakes a thread when a short callback runs longer than expected
         self.guard = Guard(self._guard_expired)
+
+    def loops(self) -> Loops:
+        """Return the event loops of coroutines, made for the first one."""
+        with self.lock:
+            if self._loops is None:
+                from mddag_executor.executor.coroutines import Loops
+                self._loops = Loops(get_logger('mddag_executor').warning)
+            return self._loops
+
+    def end_coroutines(self) -> None:
+        """Cancel coroutines that await asyncio, and end its event loop; no callback runs."""
+        if self._loops is not None:
+            self._loops.end(
+                [(work.entity.name, work.coroutine) for work in self.engine.begun()])
 
     def attach(self, executor: MultiDeadlineExecutor) -> None:
         """Set the executor; threads do not keep it alive (``ending``)."""
@@ -786,22 +803,26 @@ class WorkerPool:
 
     def _resume_after(self, work: Work, awaited: Any) -> None:
         """Resume a suspended execution when the future that it waits for is done."""
+        resume = partial(self.resume, work)
         if awaited is NEXT_TURN or not hasattr(awaited, 'add_done_callback'):
             if self._is_stepping:
                 self._of_next_step.append(work)
                 return
             work.yields += 1
             rest = min(work.yields * 1_000, MOST_YIELD_NS)
-            self.call_at(monotonic_ns() + rest, partial(self.resume, work))
+            self.call_at(monotonic_ns() + rest, resume)
         else:
             work.yields = 0
             adopt_awaited(awaited, self.executor)
-            awaited.add_done_callback(QuickCallback(partial(self.resume, work)))
+            awaited.add_done_callback(QuickCallback(resume))
+        work.coroutine.suspended(resume)
 
     @contextmanager
     def lend(self, me: WorkerThread) -> Iterator[None]:
         """Lend the worker of a running callback to other threads."""
         lends = False
+        if me.work is not None and me.work.coroutine is not None:
+            me.work.coroutine.let_others()
         with self.lock:
             if not me.is_out and me.work is not None and self._waiting_calls < MOST:
                 lends = me.has_lent = me.is_out = True

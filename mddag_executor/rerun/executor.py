@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from mddag_executor.executor.compat import alive, BareExecutor
+from mddag_executor.executor.compat import alive, BareExecutor, QuickCallback
 from mddag_executor.executor.entity import Entity, TASK
 from mddag_executor.executor.tasks import make_task, Unclaimed
-from mddag_executor.executor.work import QuickCallback, Work
+from mddag_executor.executor.work import Work
 from mddag_executor.hosting.host import Guest, Host
 from mddag_executor.rerun.loop import Loop, POLL_NS
 from rclpy.node import Node
@@ -43,7 +43,7 @@ class NodeHolder(BareExecutor):
             loop.call_in_run(lambda: loop.engine.resume(work, loop.now))
 
         task, work = make_task(
-            self.task_entity, self, resume, self._unclaimed, callback, args, kwargs)
+            self.task_entity, self, resume, self._unclaimed, None, callback, args, kwargs)
         loop.call_in_run(lambda: loop.engine.ready(work, loop.now))
         return task
 

@@ -41,10 +41,10 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DONE, empty
-from mddag_executor.executor.compat import NEXT_TURN
+from mddag_executor.executor.compat import NEXT_TURN, QuickCallback
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.jobs import Origin
-from mddag_executor.executor.work import Destroyed, QuickCallback, Refused, Work
+from mddag_executor.executor.work import Destroyed, Refused, Work
 from mddag_executor.hosting.loading import describe
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
@@ -347,6 +347,7 @@ class Loop:
             self.at(self.now + POLL_NS, ARRIVED, resume)
         else:
             waits_for.add_done_callback(QuickCallback(partial(self.call_in_run, resume)))
+        work.coroutine.suspended(partial(self.call_in_run, resume))
 
     def send(self, leave: Leave, record: Callable[[int], None] = lambda thread: None) -> None:
         """

@@ -1,0 +1,338 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The executor's asyncio event loop, which coroutines of callbacks share with worker threads.
+
+Theory of operation
+-------------------
+1.  *One thread at a time runs asyncio code.*  asyncio's objects are not thread-safe, and worker
+    threads run several coroutines at the same time.  So there is one turnstile: the thread of the
+    loop owns it except while it waits for events, and a step of a coroutine (``coroutines``) owns
+    it from its first use of the loop to its end.
+2.  *A step that does not use the loop needs no turnstile.*  ``asyncio.get_running_loop()`` returns
+    the loop in each step.  Each of its methods first lets the step join.  ``__hash__`` does so as
+    well, because ``asyncio.current_task()`` looks the task up by its loop and calls no method.
+3.  *The thread* starts with the first step that joins.  A step that has scheduled something wakes
+    it, if it would otherwise sleep too long.
+4.  *Other threads* use ``call_soon_threadsafe`` and ``run_coroutine_threadsafe``, as with any loop.
+    A callback that is no coroutine owns the turnstile for each single call.
+5.  *The end.*  Tasks that are not done are cancelled, and a warning names them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Coroutine
+from functools import partial, wraps
+import selectors
+import threading
+from threading import get_ident
+import time
+import types
+from typing import Any, Protocol
+
+from mddag_executor.executor.compat import awaited, NEXT_TURN, QuickCallback
+
+CLOSE_S = 2.0
+"""How long cancelled tasks may take to end."""
+
+
+class Turnstile:
+    """A lock that threads get in the order in which they ask for it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._is_taken = False
+        self._queue: deque[threading.Lock] = deque()
+
+    def acquire(self) -> None:
+        """Wait until the calling thread owns it."""
+        with self._lock:
+            if not self._is_taken:
+                self._is_taken = True
+                return
+            turn = threading.Lock()
+            turn.acquire()
+            self._queue.append(turn)
+        turn.acquire()
+
+    def release(self) -> None:
+        """Pass it to the thread that has waited longest."""
+        with self._lock:
+            if self._queue:
+                self._queue.popleft().release()
+            else:
+                self._is_taken = False
+
+
+class _Selector(selectors.DefaultSelector):  # type: ignore[misc, valid-type]
+    """Gives the turnstile up while the loop waits for events."""
+
+    loop: CallbackLoop | None = None
+
+    def select(self, timeout: float | None = None) -> Any:
+        """Wait for events."""
+        loop = self.loop
+        if loop is None:
+            return super().select(timeout)
+        loop.let_others(timeout)
+        try:
+            return super().select(timeout)
+        finally:
+            loop.own()
+
+
+class Stepped(Protocol):
+    """A coroutine of which a step runs; see ``coroutines.Steps``."""
+
+    loop: Any
+    has_joined: bool
+
+    def let_others(self) -> None:
+        """Give the turnstile up."""
+
+
+class _Stepping(threading.local):
+    steps: Stepped | None = None
+
+
+stepping = _Stepping()
+"""Of the calling thread: ``steps``, the coroutine of which a step runs in it."""
+
+# What is safe in any thread, or is not for callbacks.
+_UNGUARDED = {
+    'call_soon_threadsafe', 'run_forever', 'run_until_complete', 'stop', 'is_running',
+    'is_closed', 'close', 'shutdown_asyncgens', 'shutdown_default_executor', 'get_debug',
+    'set_debug', 'set_task_factory', 'get_task_factory', 'set_default_executor',
+    'set_exception_handler', 'get_exception_handler'}
+
+
+class CallbackLoop(asyncio.SelectorEventLoop):
+    """
+    An event loop whose methods steps of coroutines may use in any thread.
+
+    :param warn: receives a line about tasks that are cancelled at the end.
+    """
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        selector = _Selector()
+        super().__init__(selector)
+        selector.loop = self
+        self._warn = warn
+        self._turnstile = Turnstile()
+        self._owner = 0
+        self._wakes_at = 0.0    # when its thread wakes by itself
+        self._thread: threading.Thread | None = None
+        self._start_lock = threading.Lock()
+        self.set_task_factory(_task)
+
+    def __hash__(self) -> int:
+        """Return the hash; whoever asks for it may ask for the current task (rule 2)."""
+        if self._owner != get_ident():
+            self.join()
+        return object.__hash__(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def _check_thread(self) -> None:
+        """Allow calls from steps in debug mode, too: they own the turnstile."""
+
+    # --- the turnstile ---------------------------------------------------------------------------
+
+    def own(self) -> None:
+        """Let the calling thread run asyncio code."""
+        self._turnstile.acquire()
+        self._owner = get_ident()
+
+    def let_others(self, timeout: float | None) -> None:
+        """Let other threads run asyncio code while the loop waits for events."""
+        self._wakes_at = float('inf') if timeout is None else self._clock() + timeout
+        self._owner = 0
+        self._turnstile.release()
+
+    def join(self) -> bool:
+        """Let the calling thread's step run asyncio code to its end; False: there is no step."""
+        steps = stepping.steps
+        if steps is None or steps.loop is not self:
+            return False
+        self._start()
+        self.own()
+        steps.has_joined = True
+        asyncio._enter_task(self, steps)  # type: ignore[arg-type]
+        return True
+
+    def leave(self, steps: Stepped) -> None:
+        """Note that a step that has joined ends or pauses."""
+        asyncio._leave_task(self, steps)  # type: ignore[arg-type]
+        steps.has_joined = False
+        self._give_up()
+
+    def _give_up(self) -> None:
+        scheduled: Any = self._scheduled  # type: ignore[attr-defined]
+        wakes = bool(self._ready) or (  # type: ignore[attr-defined]
+            len(scheduled) > 0 and scheduled[0]._when < self._wakes_at)
+        self._owner = 0
+        self._turnstile.release()
+        if wakes:
+            self._write_to_self()  # type: ignore[attr-defined]
+
+    def guarded(self, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call a method in a thread that does not own the turnstile."""
+        if self.join():
+            return method(self, *args, **kwargs)
+        self._start()
+        self.own()
+        try:
+            return method(self, *args, **kwargs)
+        finally:
+            self._give_up()
+
+    _clock = staticmethod(time.monotonic)
+
+    # --- its thread ------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        if self._thread is not None or self.is_closed():
+            return
+        with self._start_lock:
+            if self._thread is None:
+                runs = threading.Event()
+                self.call_soon_threadsafe(runs.set)
+                self._thread = threading.Thread(
+                    target=self._run, name='mddag-asyncio', daemon=True)
+                self._thread.start()
+                runs.wait()
+
+    def _run(self) -> None:
+        self.own()
+        asyncio.set_event_loop(self)
+        try:
+            self.run_forever()
+        finally:
+            try:
+                self._cancel_tasks()
+            finally:
+                self._owner = 0
+                self._turnstile.release()
+
+    def _cancel_tasks(self) -> None:
+        """Cancel what is not done, and let it end."""
+        tasks = asyncio.all_tasks(self)
+        for task in tasks:
+            self._warn(f'the asyncio task {name_of(task.get_coro())} has not ended before its '
+                       'executor: it is cancelled')
+            task.cancel()
+        if tasks:
+            self.run_until_complete(asyncio.wait(tasks, timeout=CLOSE_S))
+        self.run_until_complete(self.shutdown_asyncgens())
+        executor = self._default_executor  # type: ignore[attr-defined]
+        if executor is not None:
+            executor.shutdown(wait=False)
+
+    def end(self) -> None:
+        """Cancel what is not done, end the thread, and close the loop."""
+        thread = self._thread
+        if self.is_closed():
+            return
+        if thread is not None:
+            self.call_soon_threadsafe(self.stop)
+            if thread is threading.current_thread():
+                return
+            thread.join(2 * CLOSE_S)
+            if thread.is_alive():
+                self._warn('a callback of asyncio has not ended: it is left behind')
+                return
+        self.close()
+
+
+def _guard(name: str) -> None:
+    method = getattr(asyncio.SelectorEventLoop, name)
+
+    @wraps(method)
+    def guarded(self: CallbackLoop, *args: Any, **kwargs: Any) -> Any:
+        if self._owner == get_ident():
+            return method(self, *args, **kwargs)
+        return self.guarded(method, *args, **kwargs)
+
+    setattr(CallbackLoop, name, guarded)
+
+
+for _name in vars(asyncio.AbstractEventLoop):
+    if not _name.startswith('_') and _name not in _UNGUARDED and hasattr(
+            asyncio.SelectorEventLoop, _name):
+        _guard(_name)
+
+
+# --- rclpy's futures in asyncio's tasks ------------------------------------------------------------
+
+def name_of(coroutine: Any) -> str:
+    """Return the name of a coroutine for messages."""
+    return str(getattr(coroutine, '__qualname__', type(coroutine).__name__))
+
+
+def is_asyncio_future(yielded: Any) -> bool:
+    """Return whether a coroutine has yielded a future of asyncio, to wait for it."""
+    return getattr(yielded, '_asyncio_future_blocking', None) is not None
+
+
+def _task(
+    loop: asyncio.AbstractEventLoop, coroutine: Any, **kwargs: Any
+) -> asyncio.Task[Any]:
+    """Return a task of the loop that may also await futures of rclpy."""
+    if type(coroutine) is types.CoroutineType:
+        coroutine = _bridged(coroutine, loop)
+    return asyncio.Task(coroutine, loop=loop, **kwargs)
+
+
+def _bridged(inner: Any, loop: asyncio.AbstractEventLoop) -> Coroutine[Any, Any, Any]:
+    made = _await(_Bridge(inner, loop))
+    made.__name__, made.__qualname__ = inner.__name__, inner.__qualname__
+    return made
+
+
+async def _await(awaitable: Any) -> Any:
+    return await awaitable
+
+
+class _Bridge:
+    """Runs a coroutine within a task of asyncio; translates the futures of rclpy that it awaits."""
+
+    __slots__ = ('_inner', '_loop')
+
+    def __init__(self, inner: Any, loop: asyncio.AbstractEventLoop) -> None:
+        self._inner = inner
+        self._loop = loop
+
+    def __await__(self) -> Any:
+        inner, error = self._inner, None
+        while True:
+            try:
+                yielded = inner.send(None) if error is None else inner.throw(error)
+            except StopIteration as stop:
+                return stop.value
+            error = None
+            try:
+                yield yielded if is_asyncio_future(yielded) else self._waiter(yielded)
+            except GeneratorExit:
+                inner.close()
+                raise
+            except BaseException as raised:
+                error = raised
+
+    def _waiter(self, yielded: Any) -> Any:
+        """Return a future of asyncio that is done when the one of rclpy is; None: next turn."""
+        waits_for = awaited(self._inner) if yielded is None else yielded
+        if waits_for is NEXT_TURN:
+            return None
+        waiter = self._loop.create_future()
+        waits_for.add_done_callback(QuickCallback(partial(
+            self._loop.call_soon_threadsafe, _set_done, waiter)))
+        waiter._asyncio_future_blocking = True
+        return waiter
+
+
+def _set_done(waiter: asyncio.Future[None]) -> None:
+    if not waiter.done():
+        waiter.set_result(None)
