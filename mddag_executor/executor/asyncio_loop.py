@@ -13,8 +13,9 @@ Theory of operation
     the loop in each step.  Each of its methods first lets the step join.  ``__hash__`` does so as
     well, because ``asyncio.current_task()`` looks the task up by its loop and calls no method.
 3.  *The thread* starts with the first step that joins.  A step that has scheduled something wakes
-    it, if it would otherwise sleep too long.
-4.  *Other threads* use ``call_soon_threadsafe`` and ``run_coroutine_threadsafe``, as with any loop.
+    it, if it would otherwise sleep too long.  A future that is done makes the execution that
+    awaits it ready at once, in the thread that has completed it.
+4.  *Other threads* use ``call_soon_threadsafe`` or ``run_coroutine_threadsafe``, as with any loop.
     A callback that is no coroutine owns the turnstile for each single call.
 5.  *The end.*  Tasks that are not done are cancelled, and a warning names them.
 """
@@ -23,7 +24,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
+import contextvars
 from functools import partial, wraps
 import selectors
 import threading
@@ -66,7 +68,7 @@ class Turnstile:
                 self._is_taken = False
 
 
-class _Selector(selectors.DefaultSelector):  # type: ignore[misc, valid-type]
+class _Selector(selectors.DefaultSelector):
     """Gives the turnstile up while the loop waits for events."""
 
     loop: CallbackLoop | None = None
@@ -138,6 +140,16 @@ class CallbackLoop(asyncio.SelectorEventLoop):
 
     def _check_thread(self) -> None:
         """Allow calls from steps in debug mode, too: they own the turnstile."""
+
+    def call_soon(  # type: ignore[override]
+        self, callback: Callable[..., object], *args: Any,
+        context: contextvars.Context | None = None,
+    ) -> asyncio.Handle:
+        """Call a function in the next turn; one that makes a step ready at once (rule 3)."""
+        if type(callback) is QuickCallback:
+            callback(*args)
+            return asyncio.Handle(callback, args, self)
+        return super().call_soon(callback, *args, context=context)
 
     # --- the turnstile ---------------------------------------------------------------------------
 
@@ -248,7 +260,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
 
 
 def _guard(name: str) -> None:
-    method = getattr(asyncio.SelectorEventLoop, name)
+    method = getattr(CallbackLoop, name)
 
     @wraps(method)
     def guarded(self: CallbackLoop, *args: Any, **kwargs: Any) -> Any:
@@ -265,7 +277,7 @@ for _name in vars(asyncio.AbstractEventLoop):
         _guard(_name)
 
 
-# --- rclpy's futures in asyncio's tasks ------------------------------------------------------------
+# --- rclpy's futures in asyncio's tasks ----------------------------------------------------------
 
 def name_of(coroutine: Any) -> str:
     """Return the name of a coroutine for messages."""
@@ -286,8 +298,8 @@ def _task(
     return asyncio.Task(coroutine, loop=loop, **kwargs)
 
 
-def _bridged(inner: Any, loop: asyncio.AbstractEventLoop) -> Coroutine[Any, Any, Any]:
-    made = _await(_Bridge(inner, loop))
+def _bridged(inner: Any, loop: asyncio.AbstractEventLoop) -> Any:
+    made: Any = _await(_Bridge(inner, loop))
     made.__name__, made.__qualname__ = inner.__name__, inner.__qualname__
     return made
 
@@ -297,7 +309,7 @@ async def _await(awaitable: Any) -> Any:
 
 
 class _Bridge:
-    """Runs a coroutine within a task of asyncio; translates the futures of rclpy that it awaits."""
+    """Runs a coroutine within a task of asyncio, where it may await futures of rclpy."""
 
     __slots__ = ('_inner', '_loop')
 

@@ -7,10 +7,10 @@ Theory of operation
 -------------------
 A worker runs one step of a coroutine: up to the future that it awaits next.  When that future is
 done, the execution becomes ready again.  This is the same for both kinds of futures.  During a
-step ``asyncio.get_running_loop()`` returns the executor's loop (``asyncio_loop``), and the ``Steps``
-are the current task, so ``asyncio.timeout`` and a ``TaskGroup`` can cancel them.  If the thread
-that spins already runs an event loop (``asyncio.run`` with ``spin_once``, or ``spin_async``), the
-steps use that loop instead.
+step ``asyncio.get_running_loop()`` returns the executor's loop (``asyncio_loop``), and the
+``Steps`` are the current task, so ``asyncio.timeout`` and a ``TaskGroup`` can cancel them.  If the
+thread that spins already runs an event loop (``asyncio.run`` with ``spin_once``, or
+``spin_async``), the steps use that loop instead.
 """
 
 from __future__ import annotations
@@ -112,9 +112,9 @@ class Steps:
         """
         self._drive.send(None)
 
-    def as_coroutine(self) -> Coroutine[Any, Any, Any]:
+    def as_coroutine(self) -> Any:
         """Return a coroutine that runs a step each time it is resumed, for rclpy's tasks."""
-        made = self._whole()
+        made: Any = self._whole()
         made.__name__, made.__qualname__ = self._inner.__name__, self._inner.__qualname__
         return made
 

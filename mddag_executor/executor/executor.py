@@ -661,11 +661,12 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _stepping_epoll(self) -> select.epoll:
         """Return the epoll in which a spin in the calling thread waits."""
-        if self._ending.stepping is None:
-            self._ending.stepping = select.epoll()
-            self._ending.stepping.register(self._pool.loop.fd, select.EPOLLIN)
-            self._ending.stepping.register(self._at_once.loop.fd, select.EPOLLIN)
-        return self._ending.stepping
+        stepping: select.epoll | None = self._ending.stepping
+        if stepping is None:
+            stepping = self._ending.stepping = select.epoll()
+            stepping.register(self._pool.loop.fd, select.EPOLLIN)
+            stepping.register(self._at_once.loop.fd, select.EPOLLIN)
+        return stepping
 
     def _handle_once(self) -> bool:
         """Handle ready events; run one callback if there is one, and return whether one ran."""

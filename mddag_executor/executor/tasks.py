@@ -58,7 +58,7 @@ class ObservedTask(BareTask):
         self.deferred_to: Callable[[BaseException], None] | None = None
         self.spins = 0
         self._claims = [None]
-        super().__init__(*args, **kwargs)
+        super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
 
     def __del__(self) -> None:
         """Report a deferred exception: it cannot be handled any more."""
@@ -199,7 +199,8 @@ class TaskEntities:
 
 def make_task(
     entity: Entity, executor: Any, resume: Callable[[TaskWork], None], unclaimed: Unclaimed,
-    loops: Callable[[], Loops] | None, callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any],
+    loops: Callable[[], Loops] | None, callback: Any, args: tuple[Any, ...],
+    kwargs: dict[str, Any],
 ) -> tuple[ObservedTask, TaskWork]:
     """
     Make a task of a function, a coroutine function or a coroutine, and the work that runs it.

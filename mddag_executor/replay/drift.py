@@ -39,11 +39,10 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             of.add(int(mine.min()))
             of.add(int(mine.max()))
             of.count = len(mine)
-    # declared callbacks that were started; other executions once each
+    # declared callbacks that were started, and other executions, a coroutine's once each
     vertex, start, end = (table[name].copy() for name in ('vertex', 'start', 'end'))
     declared = (vertex >= 0) & (start >= 0)
-    others = (vertex < 0) & (end >= 0) & (table['piece'] == 0)
-    every = declared | others
+    every = (declared | (vertex < 0) & (end >= 0)) & (table['piece'] == 0)
     waits = (end < 0) & (start >= recording.end)
     late = (end >= since) | (end < 0)
     del vertex, start, end

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes run again from a bag: what they see, what they publish, and when."""
 
+import asyncio
 from functools import cached_property, partial
 import gc
 import os
@@ -391,6 +392,14 @@ def test_a_failed_run_leaves_the_files_of_before(bag, graph, tmp_path):
     with pytest.raises(CallbackFailed, match='it raised ZeroDivisionError: .* at 0.000000 s'):
         run_filter(bag, graph, lambda node, number: 1 / number, overwrite=True, **files)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_callback_that_awaits_asyncio_is_refused(bag, graph):
+    async def sleep():
+        await asyncio.sleep(0.01)
+
+    with pytest.raises(CallbackFailed, match='a rerun does not run asyncio: leave this node out'):
+        run_filter(bag, graph, fill=lambda node: node.create_timer(0.01, sleep))
 
 
 def test_a_callback_destroys_its_node(bag, graph):

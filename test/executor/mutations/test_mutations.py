@@ -112,7 +112,7 @@ may not check
     Case('unknown_waits_not_resumed', [
         ('executor/workers.py', 'self._of_next_step.append(work)', 'pass'),
         ('executor/workers.py',
-         'self.call_at(monotonic_ns() + rest, partial(self.resume, work))', 'pass')], of(
+         'self.call_at(monotonic_ns() + rest, resume)', 'pass')], of(
         'test_tasks.py',
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-False]',
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-True]'),

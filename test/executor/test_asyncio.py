@@ -1,0 +1,402 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Callbacks that await asyncio: in each way of spinning, cancelled, at the end, at random."""
+
+import asyncio
+from collections import Counter
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor import current_job
+from mddag_executor.replay import replay
+from mddag_executor.replay.drift import drift_of
+from msg_graph import loads
+import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from .conftest import Spinning, wait_for
+from .declared import graph
+
+needs_timeout = pytest.mark.skipif(
+    sys.version_info < (3, 11), reason='asyncio.timeout is new in Python 3.11')
+
+
+def spin(executor, done):
+    """Spin on the pool until a future is done."""
+    executor.spin_until_future_complete(done, 15)
+
+
+def spin_once(executor, done):
+    """Step until a future is done; the coroutines use the executor's own loop."""
+    end = time.monotonic() + 15
+    while not done.done() and time.monotonic() < end:
+        executor.spin_once(0.1)
+
+
+def step_in_loop(executor, done):
+    """Step in a program's own loop until a future is done."""
+    async def main():
+        end = time.monotonic() + 15
+        while not done.done() and time.monotonic() < end:
+            executor.spin_once(0)
+            await asyncio.sleep(0.001)
+    asyncio.run(main())
+
+
+def spin_async(executor, done):
+    """Spin in a program's own loop until a future is done."""
+    async def main():
+        spinning = asyncio.ensure_future(executor.spin_async())
+        over = asyncio.get_running_loop().create_future()
+        done.add_done_callback(lambda _: over.set_result(None))
+        await asyncio.wait_for(over, 15)
+        spinning.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await spinning
+    asyncio.run(main())
+
+
+@pytest.fixture(params=[spin, spin_once, step_in_loop, spin_async])
+def until_done(request):
+    """Give the ways of spinning until a future is done."""
+    return request.param
+
+
+def test_what_asyncio_offers_works_in_callbacks(make_executor, make_node, until_done):
+    """Timers, subscriptions, services and tasks; futures of rclpy and of asyncio side by side."""
+    node, found, done = make_node(), [], Future()
+    group = ReentrantCallbackGroup()
+    client = node.create_client(Trigger, 'asked', callback_group=group)
+    queues = []
+
+    async def serve(_, response):
+        await asyncio.sleep(0.001)
+        response.message = 'served'
+        return response
+
+    async def ask():
+        return (await client.call_async(Trigger.Request())).message
+
+    async def hear(message):
+        if not queues:
+            queues.append(asyncio.Queue())
+        await queues[0].put(message.frame_id)
+
+    async def tick():
+        timer.cancel()
+        publisher.publish(Header(frame_id='sent'))
+        assert await asyncio.sleep(0.001, 'slept') == 'slept'
+        found.append(await asyncio.wait_for(client.call_async(Trigger.Request()), 10))
+        found.append(await asyncio.gather(
+            asyncio.sleep(0.002, 1), ask(), client.call_async(Trigger.Request()),
+            asyncio.to_thread(threading.get_ident)))
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(Future(), 0.001)
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(asyncio.Event().wait(), 0.001)
+        while not queues:
+            await asyncio.sleep(0)
+        found.append(await queues[0].get())
+        reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        found.append(await reader.read())
+        writer.close()
+        made = executor.create_task(asyncio.sleep(0, 'a task'))
+        found.append(await made)
+        done.set_result(None)
+
+    async def answer(reader, writer):
+        writer.write(b'over a socket')
+        writer.close()
+
+    async def start_server():
+        nonlocal server
+        server = await asyncio.start_server(answer, '127.0.0.1', 0)
+        timer.reset()
+        executor.wake()
+
+    server = None
+    node.create_service(Trigger, 'asked', serve, callback_group=group)
+    publisher = node.create_publisher(Header, '/sent', 10)
+    node.create_subscription(Header, '/sent', hear, 10, callback_group=group)
+    timer = node.create_timer(0.001, tick, callback_group=group, autostart=False)
+    executor = make_executor(nodes=[node])
+    executor.create_task(start_server)
+    until_done(executor, done)
+    assert done.done()
+    first, several, heard, read, made = found
+    assert first.message == 'served'
+    assert several[:2] == [1, 'served'] and several[2].message == 'served'
+    assert several[3] != threading.get_ident()
+    assert (heard, read, made) == ('sent', b'over a socket', 'a task')
+
+
+@needs_timeout
+def test_the_coroutine_of_a_callback_is_the_current_task(make_executor, until_done):
+    found, done = [], Future()
+
+    async def fail():
+        await asyncio.sleep(0.001)
+        raise ValueError('of a child')
+
+    async def ask():
+        assert asyncio.current_task().get_coro().__name__ == 'ask'  # before anything else
+        assert asyncio.current_task().get_loop() is asyncio.get_running_loop()
+        for never in (Future(), asyncio.get_running_loop().create_future()):
+            try:
+                async with asyncio.timeout(0.001):
+                    await never
+            except TimeoutError:
+                found.append('timeout')
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(fail())
+                group.create_task(asyncio.sleep(100))
+                await Future()
+        except ExceptionGroup as several:  # noqa: F821
+            found.append(str(several.exceptions[0]))
+        assert not asyncio.current_task().cancelling()
+        await asyncio.sleep(0.001)
+        done.set_result(None)
+
+    executor = make_executor()
+    executor.create_task(ask)
+    until_done(executor, done)
+    assert found == ['timeout', 'timeout', 'of a child']
+
+
+def test_a_cancelled_callback_ends_without_an_error(make_executor, make_node, until_done):
+    """A task of rclpy is cancelled then; those that nobody cancelled fail."""
+    done, node = Future(), make_node()
+
+    async def cancel_itself():
+        asyncio.current_task().cancel()
+        await Future()
+
+    async def tick():
+        timer.cancel()
+        await cancel_itself()
+
+    async def check():
+        while not cancelled.cancelled():
+            await asyncio.sleep(0.001)
+        done.set_result(None)
+
+    async def raise_it():
+        raise asyncio.CancelledError
+
+    timer = node.create_timer(0.001, tick)
+    executor = make_executor(nodes=[node])
+    cancelled = executor.create_task(cancel_itself)
+    executor.create_task(check)
+    until_done(executor, done)
+    assert cancelled.cancelled() and not cancelled.done()
+
+    timer.callback = raise_it
+    timer.reset()
+    with pytest.raises(asyncio.CancelledError):
+        executor.spin_until_future_complete(Future(), 10)
+
+
+def test_groups_and_jobs_are_kept_while_a_callback_sleeps(make_executor, make_node, tmp_path):
+    """A mutually exclusive group stays with it; it goes on for its job, also in a recording."""
+    node, jobs, running, overlaps = make_node('n'), [], set(), []
+    publisher = node.create_publisher(Header, '/a', 10)
+
+    async def sleep(name):
+        overlaps.extend(running)
+        running.add(name)
+        await asyncio.sleep(0.003)
+        running.remove(name)
+
+    async def hear(_):
+        before = current_job()
+        await sleep('hear')
+        jobs.append((before[1], current_job()[1]))
+
+    node.create_timer(0.01, lambda: publisher.publish(Header()),
+                      callback_group=MutuallyExclusiveCallbackGroup())
+    node.create_timer(0.004, lambda: sleep('other'))
+    node.create_subscription(Header, '/a', hear, 10)
+    text = graph(n="""
+        name: tick, timer: 10ms, publishes: [/a]
+        name: hear, subscription: /a, deadline: 10s""")
+    trace = str(tmp_path / 'run.mcap')
+    with Spinning(make_executor(loads(text), nodes=[node], trace=trace)):
+        assert wait_for(lambda: len(jobs) > 20)
+    outcome = replay(trace)
+    parts, = outcome.chains.breakdown().values()
+    assert parts['mean']['suspended_ns'] > 3_000_000 and not drift_of(outcome.recording)
+    assert not overlaps
+    assert all(a == b for a, b in jobs) and [a for a, _ in jobs] == sorted({a for a, _ in jobs})
+
+
+def test_many_coroutines_sleep_at_once(make_executor):
+    executor, threads = make_executor(num_workers=2), set()
+    done, left = Future(), 1000
+
+    async def sleep():
+        nonlocal left
+        await asyncio.sleep(0.02)
+        threads.add(threading.get_ident())
+        await asyncio.sleep(0)
+        left -= 1  # no other step runs between the two: they are joined
+        if not left:
+            done.set_result(None)
+
+    for _ in range(1000):
+        executor.create_task(sleep)
+    spin(executor, done)
+    assert done.done() and len(threads) <= 2
+
+
+class Model:
+    """
+    Coroutines that await futures of both kinds in a random order; how far each has to be.
+
+    :ivar steps: of each coroutine, how many of its waits are over.
+    """
+
+    def __init__(self, executor, seed):
+        self.random = random.Random(seed)
+        self.executor = executor
+        self.loop = None
+        self.futures = []
+        self.done = set()
+        self.programs = []
+        self.steps = []
+
+    async def make(self, coroutines, futures):
+        """Make the futures in the loop, and start the coroutines."""
+        self.loop = asyncio.get_running_loop()
+        self.futures = [self.random.choice((Future, self.loop.create_future))()
+                        for _ in range(futures)]
+        for number in range(coroutines):
+            self.programs.append([
+                self.random.sample(range(futures), self.random.choice((1, 1, 1, 2)))
+                for _ in range(self.random.randint(1, 6))])
+            self.steps.append(0)
+            start = self.random.choice((self.executor.create_task, self.loop.create_task))
+            start(self.run(number))
+
+    async def run(self, number):
+        """Await the futures of a coroutine, one after the other or two at once."""
+        for several in self.programs[number]:
+            if len(several) == 1:
+                assert await self.futures[several[0]] == several[0]
+            else:
+                assert await asyncio.gather(*(self.futures[i] for i in several)) == several
+            assert self.done.issuperset(several)
+            self.steps[number] += 1
+
+    def complete(self):
+        """Complete one or more futures, from this thread."""
+        left = sorted({*range(len(self.futures))} - self.done)
+        for i in self.random.sample(left, min(len(left), self.random.choice((1, 1, 2, 5)))):
+            self.done.add(i)
+            if isinstance(self.futures[i], Future):
+                self.futures[i].set_result(i)
+            else:
+                self.loop.call_soon_threadsafe(self.futures[i].set_result, i)
+
+    def expected(self):
+        """Return how many waits of each coroutine have to be over."""
+        return [next((n for n, several in enumerate(program)
+                      if not self.done.issuperset(several)), len(program))
+                for program in self.programs]
+
+
+def test_random_orders_of_both_kinds_of_futures(make_executor):
+    """`MDDAG_THOROUGH=20` tries more than 10,000 waits."""
+    waits, times = 0, int(os.environ.get('MDDAG_THOROUGH', '1'))
+    executor = make_executor(num_workers=3)
+    with Spinning(executor):
+        for seed in range(4 * times):
+            model = Model(executor, seed)
+            made = executor.create_task(model.make, 50, 12)
+            assert wait_for(made.done)
+            while len(model.done) < 12:
+                model.complete()
+                assert wait_for(lambda: model.steps == model.expected()), seed  # noqa: B023
+            waits += sum(model.steps)
+    assert waits > 500 * times
+
+
+def test_coroutines_that_await_asyncio_at_the_end_are_cancelled(ros_context, make_node, capfd):
+    ended = Counter()
+
+    async def sleep():
+        try:
+            await asyncio.sleep(100)
+        finally:
+            ended['callback'] += 1
+
+    async def child():
+        try:
+            await asyncio.sleep(100)
+        finally:
+            ended['task'] += 1
+
+    async def start():
+        children.append(asyncio.get_running_loop().create_task(child()))
+        await asyncio.sleep(0.001)
+
+    node, children = make_node(), []
+    node.create_timer(0.001, sleep)
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    with Spinning(executor):
+        started = executor.create_task(start)
+        assert wait_for(lambda: started.done() and is_suspended(executor))
+    assert ended == {'callback': 1, 'task': 1} and children[0].cancelled()
+    said = capfd.readouterr().err
+    assert '/node: sleep (timer 1ms): its coroutine' in said and '.sleep has not ended' in said
+    assert 'the asyncio task' in said and '.child has not ended' in said
+    assert not any(t.name == 'mddag-asyncio' for t in threading.enumerate())
+
+
+def is_suspended(executor):
+    return any('sleep' in str(w.coroutine.get_coro()) for w in executor._engine.begun())
+
+
+def test_without_coroutines_there_is_no_loop():
+    code = ('import rclpy, sys\n'
+            'from mddag_executor import MultiDeadlineExecutor\n'
+            'rclpy.init()\n'
+            'node = rclpy.create_node("n")\n'
+            'executor = MultiDeadlineExecutor()\n'
+            'executor.add_node(node)\n'
+            'executor.spin_once(0.1)\n'
+            'executor.shutdown()\n'
+            'assert "asyncio" not in sys.modules\n')
+    subprocess.run([sys.executable, '-c', code], check=True, timeout=60)
+
+
+def test_spin_async_ends_as_spin_does(make_executor, ros_context):
+    executor = make_executor()
+
+    async def fail():
+        await asyncio.sleep(0.001)
+        raise ValueError('in a task')
+
+    async def main():
+        executor.create_task(fail)
+        with pytest.raises(ValueError, match='in a task'):
+            await executor.spin_async()
+        spinning = asyncio.ensure_future(executor.spin_async())
+        await asyncio.sleep(0.01)
+        with pytest.raises(RuntimeError, match='already spinning'):
+            executor.spin_once(0)
+        threading.Timer(0.01, ros_context.shutdown).start()
+        with pytest.raises(ExternalShutdownException):
+            await asyncio.wait_for(spinning, 10)
+
+    asyncio.run(main())
