@@ -226,6 +226,11 @@ class Steps:
         """Return whether the coroutine has ended."""
         return self._is_done
 
+    @property
+    def _fut_waiter(self) -> Any:
+        """Return the future of asyncio that it awaits, as anyio asks asyncio's tasks."""
+        return self.waits_for if is_asyncio_future(self.waits_for) else None
+
     def get_loop(self) -> Any:
         """Return the event loop."""
         return self.loop
