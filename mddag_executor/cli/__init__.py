@@ -8,7 +8,7 @@ A verb's module is imported only when its verb is run, and has these names:
 | name | meaning |
 | --- | --- |
 | `EXAMPLE` | one command line or more, shown by `--help` |
-| `DESCRIPTION` | what `--help` begins with, if that is more than the verb's line in `main.py` |
+| `DESCRIPTION` | what `--help` begins with, if that is more than the verb's line in `verbs.py` |
 | `add_arguments(parser)` | declares the arguments |
 | `main(args) -> int` | does the work and returns the exit status (0, or 1 for `--fail-on-miss`) |
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import os
 
-from mddag_executor.cli.main import load, VERBS
+from mddag_executor.cli.verbs import load, VERBS
 
 
 def complete() -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import errno
-from importlib import import_module
 import io
 import math
 import os
@@ -24,12 +23,13 @@ import signal
 import sys
 import threading
 import time
-from types import FrameType, ModuleType
+from types import FrameType
 from typing import Any
 
 from mddag_executor import __version__
 from mddag_executor.cli.parsing import Parser, unknown, verb_parser
 from mddag_executor.cli.text import label, one_line, set_quiet
+from mddag_executor.cli.verbs import load, REMOVED, TASKS, VERBS
 from mddag_executor.errors import from_user_code, MddagError, UsageError, UserCodeError
 from mddag_executor.hosting.signals import SAME_SIGNAL_S
 
@@ -41,49 +41,9 @@ EXIT_SIGNAL = 128
 """A shell adds the number of the signal."""
 
 
-# Each verb and its one-line help, by task. `graph check` is the module `graph_check`.
-TASKS = {
-    'Run': {
-        'run': 'run rclpy nodes, or nodes made from the declaration, and record them',
-        'rerun': 'run real nodes again from a recording, in virtual time',
-        'top': 'show the deadlines and workers of running executors, live',
-        'demo': 'run the whole Autoware workload, record it and replay the recording'},
-    'Judge': {
-        'replay': 'check a recorded run against its deadlines, or reschedule it',
-        'explain': 'say why each deadline of a recorded run was missed',
-        'slack': 'find how much longer callbacks may take before a deadline is missed',
-        'diff': 'compare two recorded runs sink by sink',
-        'export': 'turn a recording into files for Perfetto or for data frames',
-        'import ctf': 'turn a CARET or ros2_tracing recording (LTTng) into a trace'},
-    'Plan': {
-        'graph check': 'validate a declaration, show its DAGs and whether the deadlines can hold',
-        'graph draw': 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)',
-        'graph from-trace': 'make a declaration to fill in from a recorded run',
-        'graph from-caret': 'make a declaration to fill in from a CARET architecture file',
-        'graph place': 'pack the nodes into processes, so that each needs Python little'},
-    'Laboratory': {
-        'simulate': 'run a declaration in virtual time',
-        'evaluate': 'measure acceptance ratios over many simulated runs',
-        'generate': 'make random multi-deadline, multi-rate DAG sets',
-        'graph assign-deadlines': 'give the sinks deadlines, by critical path or by search'},
-    'Develop': {
-        'graph schema': 'print the JSON Schema of declarations, for editors'},
-}
-VERBS = {verb: summary for verbs in TASKS.values() for verb, summary in verbs.items()}
-# What to do instead of a verb that earlier versions had.
-REMOVED = {
-    'graph analyse': "'mddag graph check' tests whether the deadlines can hold",
-    'graph from-ros': "record the nodes with 'mddag run --node SPEC --trace RUN.mcap' or "
-                      "'ros2 trace', and give the recording to 'mddag graph from-trace'",
-}
 _FAMILIES = {verb.split()[0] for verb in VERBS if ' ' in verb}
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
-
-
-def load(verb: str) -> ModuleType:
-    """Import the module of a verb."""
-    return import_module(f'mddag_executor.cli.{verb.replace(" ", "_").replace("-", "_")}')
 
 
 def overview(family: str = '') -> str:

@@ -20,7 +20,7 @@ from mddag_executor.core.tally import counts, SinkTally, VERDICTS
 from mddag_executor.recording.tables import Ints, look_up, rows_by, Table
 from mddag_executor.replay import Replay
 from mddag_executor.replay.usage import PoolUse
-from mddag_executor.report.export import executions
+from mddag_executor.report.columns import executions
 from mddag_executor.report.tables import missed_share, short_names
 from mddag_executor.report.text import format_ns, printable, shortened
 from mddag_executor.report.timeline import Timeline

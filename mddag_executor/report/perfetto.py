@@ -32,7 +32,7 @@ from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.tables import Ints, NOTHING, pick, sort_by, VERTEX
 from mddag_executor.replay import Replay
-from mddag_executor.report.export import executions
+from mddag_executor.report.columns import executions
 from mddag_executor.report.protobuf import Bytes, fixed, joined, message, number, texts, where
 from mddag_executor.report.text import format_ns, printable
 import numpy as np
