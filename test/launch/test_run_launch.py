@@ -70,7 +70,7 @@ def test_a_new_option_needs_one_line(monkeypatch, tmp_path):
 
     # a child process: its options come from the folder of the run
     seen = []
-    monkeypatch.setattr(run, 'run_here', lambda args, task_set: seen.append(args) or ({}, None))
+    monkeypatch.setattr(run, 'run_here', lambda args, *_: seen.append(args) or 0)
     monkeypatch.setattr('mddag_executor.hosting.processes.belong_to_parent', lambda pid: None)
     monkeypatch.setattr('os._exit', lambda status: None)
     text = 'mddag: 1\nnodes:\n  - {node: /n, callbacks: [{name: t, timer: 9ms, deadline: 9ms}]}'
