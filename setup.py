@@ -42,6 +42,14 @@ def version() -> str:
     return found.group(1)
 
 
+def description() -> str:
+    """Return the README for a project page elsewhere: absolute links, and no hidden comments."""
+    text = (HERE / 'README.md').read_text(encoding='utf-8')
+    text = re.sub(r'<!--.*?-->\n*', '', text, flags=re.DOTALL)
+    text = re.sub(r'(!\[[^\]]*\])\((?!https?:|#)', rf'\1({URLS["repository"]}/raw/HEAD/', text)
+    return re.sub(r'\]\((?!https?:|#)', f']({URLS["repository"]}/blob/HEAD/', text)
+
+
 def files(folder: str, *patterns: str) -> list[str]:
     """Return the files of a folder that match, relative to this file as setuptools wants."""
     found = {path for pattern in patterns for path in (HERE / folder).glob(pattern)}
@@ -52,13 +60,32 @@ setup(
     name=NAME,
     version=version(),
     description='A deadline-driven executor for ROS 2 in Python, and its offline replayer',
-    long_description=(HERE / 'README.md').read_text(encoding='utf-8'),
+    long_description=description(),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
     maintainer=PACKAGE.findtext('maintainer'),
     maintainer_email=PACKAGE.find('maintainer').get('email'),
     url=URLS['repository'],
-    project_urls={'Source': URLS['repository'], 'Tracker': URLS['bugtracker']},
+    project_urls={
+        'Changelog': f'{URLS["repository"]}/blob/HEAD/CHANGELOG.md',
+        'Documentation': f'{URLS["repository"]}/blob/HEAD/docs/index.md',
+        'Source': URLS['repository'],
+        'Tracker': URLS['bugtracker'],
+    },
+    classifiers=[
+        'Development Status :: 5 - Production/Stable',
+        'Intended Audience :: Developers',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.10',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
+        'Topic :: Scientific/Engineering',
+        'Topic :: Software Development :: Debuggers',
+        'Typing :: Typed',
+    ],
     keywords=['ROS 2', 'rclpy', 'executor', 'real time', 'scheduling', 'deadline'],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*', 'msg_graph', 'msg_graph.*']),

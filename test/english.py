@@ -54,7 +54,7 @@ PATTERNS = (
     Pattern('write again, next to, alternately, in a list, receives, pass, manage, reported',
             r'\b(?:anew|beside|in turn|how-manieth|no whole number|hand(?:s|ed|ing)? (?:out|over|'
             r'back)|look(?:s|ed|ing)? after|taken (?:for|as)|takes? for granted|'
-            r'stands? (?:in|for|there)|held back|theirs)\b',
+            r'stands? (?:in|there)|held back|theirs)\b',
             'The run begins anew.'),
     Pattern('jobs are not refused or reserved any more: demoted, behind, less important',
             r'\b(?:[Jj]ob|[Cc]allback|[Ee]xecution|[Ww]ork)s? (?:is|are|was|were) refused\b|'

@@ -4,6 +4,7 @@
 
 import contextlib
 import io
+import json
 import os
 import re
 import shlex
@@ -39,10 +40,12 @@ EXTRAS = {
     'README.md': ('rclpy',),
     'docs/laboratory.md': ('matplotlib', 'distributed'),
     'docs/figures.md': ('matplotlib',),
+    'docs/from_multithreaded.md': ('rclpy',),
+    'docs/notebook.md': ('pyarrow', 'pandas', 'duckdb'),
     'docs/patterns.md': ('rclpy',),
     'docs/run.md': ('rclpy',),
     'docs/start.md': ('rclpy',),
-    'docs/tables.md': ('pyarrow', 'pandas', 'duckdb'),
+    'docs/tables.md': ('pyarrow',),
 }
 
 
@@ -101,6 +104,19 @@ def test_commands_and_options_exist(page):
 def test_every_verb_is_on_the_page_of_commands():
     text = (TOP / 'docs' / 'commands.md').read_text(encoding='utf-8')
     assert not [verb for verb in program.VERBS if not re.search(rf'`mddag {verb}[ `]', text)]
+
+
+def test_pages_of_reference_are_complete(tmp_path):
+    from mddag_executor.trace.schema import EVENTS
+    trace = (TOP / 'docs' / 'trace.md').read_text(encoding='utf-8')
+    assert not [event for event in EVENTS.values()
+                if event.provider == 'mddag' and f'`{event.name}`' not in trace]
+    out = tmp_path / 'result.json'
+    program.run(['replay', str(TOP / 'bags' / 'demo_short.mcap'), '--json', str(out), '-q'])
+    result = json.loads(out.read_text(encoding='utf-8'))
+    page = (TOP / 'docs' / 'json.md').read_text(encoding='utf-8')
+    sink = next(iter(result['dags']['control']['sinks'].values()))
+    assert not [key for key in (*result, *sink) if f'`{key}`' not in page]
 
 
 # --- the site ------------------------------------------------------------------------------------

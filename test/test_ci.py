@@ -1,0 +1,110 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""What continuous integration counts as passed, and what a release needs."""
+
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+
+from mddag_executor import __version__
+import pytest
+import yaml
+
+from .conftest import ALLOWED_SKIPS, is_allowed_skip
+
+TOP = Path(__file__).resolve().parent.parent
+# Used as make: the first call fails with these tests in the cache, and the second one passes.
+MAKE = """#!/bin/sh
+[ -e .repeated ] && exit 0
+case "$*" in *last-failed*) touch .repeated; exit {status};; esac
+mkdir -p .pytest_cache/v/cache
+{write}
+exit 1
+"""
+
+
+def run_ci(folder, failed, status=0):
+    """Run `.ci/run` with a make of which some tests fail at first; return the finished process."""
+    (folder / '.ci').mkdir()
+    for name in ('run', 'flaky'):
+        shutil.copy(TOP / '.ci' / name, folder / '.ci' / name)
+    text = json.dumps(dict.fromkeys(failed, True))
+    write = f"echo '{text}' > .pytest_cache/v/cache/lastfailed" if failed else ':'
+    make = folder / 'bin' / 'make'
+    make.parent.mkdir()
+    make.write_text(MAKE.format(status=status, write=write), encoding='utf-8')
+    make.chmod(0o755)
+    return subprocess.run(
+        ['bash', '.ci/run'], cwd=folder, text=True, capture_output=True, check=False, timeout=60,
+        env={**os.environ, 'PATH': f'{make.parent}{os.pathsep}{os.environ["PATH"]}'})
+
+
+@pytest.mark.parametrize(('failed', 'status', 'expected'), [
+    (['a.py::b'], 0, 0), (['a.py::b', 'a.py::c'], 0, 0), (['a.py::b', 'a.py::c', 'd.py::e'], 0, 1),
+    (['a.py::b'], 1, 1), ([], 0, 1)])
+def test_flaky_tests_are_named_and_at_most_two(failed, status, expected, tmp_path):
+    done = run_ci(tmp_path, failed, status)
+    assert done.returncode == expected, done.stdout + done.stderr
+    flaky = [line[7:] for line in done.stdout.splitlines() if line.startswith('FLAKY: ')]
+    assert flaky == ([] if status else failed)
+
+
+def test_a_skip_without_a_known_reason_fails_in_continuous_integration(monkeypatch):
+    assert all(is_allowed_skip(f'Skipped: {reason}') for reason in ALLOWED_SKIPS)
+    assert not is_allowed_skip('Skipped: something is not there')
+    monkeypatch.setenv('MDDAG_NO_SKIP', 'ros2 is not installed')
+    assert not is_allowed_skip('Skipped: ros2 is not installed here')
+
+
+def test_actions_are_pinned_and_workflows_are_yaml():
+    paths = sorted((TOP / '.github' / 'workflows').glob('*.yml'))
+    for path in paths:
+        text = path.read_text(encoding='utf-8')
+        assert yaml.safe_load(text)['jobs']
+        uses = re.findall(r'uses: (\S+)', text)
+        assert uses and all(re.fullmatch(r'[\w.-]+/[\w.-]+@[0-9a-f]{40}', each) for each in uses)
+    assert paths
+
+
+# --- release -------------------------------------------------------------------------------------
+
+
+def is_tagged():
+    """Return whether the checkout is that of a version's tag."""
+    if os.environ.get('GITHUB_REF_TYPE') == 'tag':
+        return True
+    done = subprocess.run(['git', 'tag', '--points-at', 'HEAD'], cwd=TOP, text=True,
+                          capture_output=True, check=False)
+    return __version__ in done.stdout.split()
+
+
+def placeholders():
+    """Return the files that have an address at example.com, which is nobody's."""
+    done = subprocess.run(
+        ['git', 'grep', '-lI', r'example\.com', '--', ':!test/test_ci.py', ':!docs/release.md'],
+        cwd=TOP, text=True, capture_output=True, check=False)
+    return done.stdout.split()
+
+
+def test_addresses_are_in_one_place_and_filled_in_at_a_tag():
+    assert set(placeholders()) <= {'package.xml'}, 'package.xml is the one place for addresses'
+    assert not (is_tagged() and placeholders()), (
+        'package.xml: fill in the maintainer and the addresses before a release')
+
+
+def test_a_project_page_has_links_that_work_everywhere():
+    done = subprocess.run(
+        [sys.executable, 'setup.py', '--quiet', '--long-description'], cwd=TOP, text=True,
+        capture_output=True, check=True, env={**os.environ, 'PYTHONWARNINGS': 'ignore'})
+    text = done.stdout
+    links = re.findall(r'\]\(([^)\s]+)\)', text)
+    assert len(links) > 30
+    assert not [link for link in links if not re.match(r'https?://|#', link)]
+    assert '<!--' not in text
+    for link in links:
+        name = re.sub(r'^.*?/(?:blob|raw)/HEAD/', '', link).partition('#')[0]
+        assert name == link.partition('#')[0] or (TOP / name).exists(), link
