@@ -23,7 +23,6 @@ from dataclasses import replace
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import (
     JobNumbers,
-    pick,
     Recording,
     RowNumbers,
 )
@@ -69,12 +68,12 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
     executions = RowNumbers(kept)
     of_kept = executions.has(sent['execution']) | (
         (sent['execution'] < 0) & (sent['time'] >= begin) & (sent['time'] < last))
-    takes = pick(takes, executions.has(takes['execution']))
+    takes = takes[executions.has(takes['execution'])]
     for message in (table['message'][kept] if recording.links else table['message'][:0],
                     takes['message']):
         of_kept[message[message >= 0]] = True
     messages = RowNumbers(of_kept)
-    table, sent = pick(table, kept), pick(sent, of_kept)
+    table, sent = table[kept], sent[of_kept]
     sent['execution'] = executions.new(sent['execution'])
     if recording.links:
         table['message'] = messages.new(table['message'])
@@ -83,11 +82,11 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
     stops, drops, demotions = recording.stops, recording.drops, recording.demotions
     losses = recording.losses
     return replace(
-        recording, releases=pick(released, seen[jobs.of(released)]), executions=table,
-        publications=sent, takes=takes, job_ends=pick(ends, seen[jobs.of(ends)]),
-        stops=pick(stops, (stops['start'] < last) & (stops['end'] > begin)),
-        drops=pick(drops, (drops['time'] >= begin) & (drops['time'] < last)),
-        losses=pick(losses, (losses['time'] >= begin) & (losses['time'] < last)),
-        demotions=pick(demotions, (demotions['time'] >= begin) & (demotions['time'] < last)),
-        misses=pick(recording.misses, judged[jobs.of(recording.misses)]),
+        recording, releases=released[seen[jobs.of(released)]], executions=table,
+        publications=sent, takes=takes, job_ends=ends[seen[jobs.of(ends)]],
+        stops=stops[(stops['start'] < last) & (stops['end'] > begin)],
+        drops=drops[(drops['time'] >= begin) & (drops['time'] < last)],
+        losses=losses[(losses['time'] >= begin) & (losses['time'] < last)],
+        demotions=demotions[(demotions['time'] >= begin) & (demotions['time'] < last)],
+        misses=recording.misses[judged[jobs.of(recording.misses)]],
         start=begin, end=until, judged_releases=(begin, end), whole=recording.whole or recording)

@@ -27,21 +27,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mddag_executor.core import legs_of
+from mddag_executor.recording.columns import Growing, rows, Table
 from mddag_executor.recording.tables import (
     ALL_LEGS,
     different,
     EXECUTIONS,
     groups,
-    Growing,
     Ints,
     LEG,
     look_up,
     Mask,
     NOTHING,
-    rows,
     rows_by,
     sort_by,
-    Table,
     UNKNOWN,
     VERTEX,
 )
@@ -192,19 +190,18 @@ class ExecutionJoin:
 
     def _dispatch(self, dispatch: Columns) -> None:
         """Add dispatched executions."""
-        table = self._executions.more(len(dispatch))
         ready, start = dispatch['ready'], dispatch['timestamp']
         strange = (ready < 0) | (ready > start)
         if strange.any():
             self._strange[f'{DISPATCH} before it was ready'] += int(strange.sum())
             ready = np.where(strange, start, ready)
-        table['dag'], table['vertex'] = self._numbering.of(dispatch['dag'], dispatch['vertex'])
-        for name in ('callback', 'job', 'worker'):
-            table[name] = dispatch[name]
-        table['thread'], table['ready'] = dispatch['vtid'], ready
-        table['began'] = table['start'] = start
-        n = len(self._executions)
-        self._dispatches.add(dispatch['vtid'], dispatch.place, np.arange(n - len(table), n))
+        dag, vertex = self._numbering.of(dispatch['dag'], dispatch['vertex'])
+        thread, before = dispatch['vtid'], len(self._executions)
+        self._executions.more(
+            len(dispatch), callback=dispatch['callback'], dag=dag, vertex=vertex,
+            job=dispatch['job'], worker=dispatch['worker'], thread=thread, ready=ready,
+            began=start, start=start)
+        self._dispatches.add(thread, dispatch.place, np.arange(before, len(self._executions)))
 
     def _owned(self, events: Columns) -> tuple[Ints, Ints]:
         """
@@ -257,10 +254,10 @@ class ExecutionJoin:
             rest[mine] &= ~np.repeat(every, until - begins)
         more = np.flatnonzero(rest)[sort_by(event[rest])]
         first = len(self._executions)
-        table = self._executions.more(len(more))
-        table['dag'], table['vertex'], table['job'] = dag[more], vertex[more], job[more]
-        for name, field in (('callback',) * 2, ('thread', 'vtid'), ('end', 'completed')):
-            table[name] = complete[field][event[more]]
+        self._executions.more(
+            len(more), dag=dag[more], vertex=vertex[more], job=job[more], **{
+                name: complete[field][event[more]] for name, field in (
+                    ('callback',) * 2, ('thread', 'vtid'), ('end', 'completed'))})
         row = np.append(row, np.arange(first, first + len(more)))
         # fill in the columns about completions, in the order of the file
         which = np.append(last_leg, more)

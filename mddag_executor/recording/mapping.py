@@ -34,9 +34,10 @@ from itertools import accumulate
 from typing import NamedTuple
 
 from mddag_executor.core import legs_of
+from mddag_executor.recording.columns import Table
 from mddag_executor.recording.entities import Callback, Entities, Node
 from mddag_executor.recording.head import ReplayError
-from mddag_executor.recording.tables import Recording, Table
+from mddag_executor.recording.tables import Recording
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
 from msg_graph import Dag, NO_GRAPH, TaskSet, Vertex
@@ -71,20 +72,20 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
     def moved(table: Table) -> Table:
         table = table.copy()
         of = table['vertex'].copy()
-        if 'leg' in (table.dtype.names or ()):
+        if 'leg' in table.names:
             known = (table['leg'] >= 0) & (table['leg'] < n_legs)
             table['leg'][known] = leg[of[known], table['leg'][known]]
         table['vertex'] = vertex[of]
-        if 'dag' in (table.dtype.names or ()):
+        if 'dag' in table.names:
             table['dag'] = np.where(vertex[of] >= 0, dag[table['dag']], -1)
-        if 'completes' in (table.dtype.names or ()):
+        if 'completes' in table.names:
             table['completes'][vertex[of] < 0] = 0
         return table
 
     def of_dags(table: Table) -> Table:
         table = table.copy()
         table['dag'] = dag[table['dag']]
-        if 'vertex' in (table.dtype.names or ()):
+        if 'vertex' in table.names:
             failed = table['vertex'] >= 0
             table['vertex'] = np.where(failed, vertex[table['vertex']], -1)
             table = table[~failed | (table['vertex'] >= 0)]

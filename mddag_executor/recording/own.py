@@ -22,6 +22,7 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.memory import give_back
+from mddag_executor.recording.columns import concatenate, Growing, rows, Table
 from mddag_executor.recording.entities import Entities, OWN_INIT_EVENTS, signed
 from mddag_executor.recording.executions import (
     Columns,
@@ -41,22 +42,18 @@ from mddag_executor.recording.tables import (
     earliest,
     EXPIRED,
     FAILED,
-    Growing,
     Ints,
     JOB_ENDS,
     LOSSES,
     Mask,
     MISSES,
     OUTDATED,
-    pick,
     PUBLICATIONS,
     Recording,
     RELEASES,
-    rows,
     rows_by,
     sort_by,
     STOPS,
-    Table,
     UNKNOWN,
 )
 from mddag_executor.text import counted
@@ -246,7 +243,7 @@ class _Source:
         published = self._pop(_PUBLISH)
         time = published['timestamp']
         if (time[1:] < time[:-1]).any():
-            published = pick(published, sort_by(time))
+            published = published[sort_by(time)]
             time = published['timestamp']
         by = running_at(executions, completed, published['vtid'], time, published['place'])
         table = rows(
@@ -258,7 +255,7 @@ class _Source:
 
     def _releases(self, released: Table) -> tuple[Table, Ints]:
         """Return the releases, and their positions in the file."""
-        released = pick(released, sort_by(released['timestamp'], released['place']))
+        released = released[sort_by(released['timestamp'], released['place'])]
         good = (released['dag'] >= 0) & (released['dag'] < len(self._task_set.dags))
         self._left_out(_RELEASE, 'of a DAG that is not declared', ~good)
         again = np.zeros(len(released), dtype=np.bool_)
@@ -267,7 +264,7 @@ class _Source:
             again[mine] = released['job'][mine] <= newest[:-1]
         self._left_out(_RELEASE, 'of a job that is not newer than the last', again)
         good &= ~again
-        released = pick(released, good)
+        released = released[good]
         release, noticed = released['release'], released['timestamp']
         to_come = (release < 0) | (release > noticed)
         self._left_out(_RELEASE, 'of a release that is still to come', to_come)
@@ -294,7 +291,7 @@ class _Source:
                 JOB_ENDS, int(good.sum()), dag=found['dag'][good], vertex=vertex[good],
                 job=found['job'][good], time=found['timestamp'][good], reason=reason))
             places.append(found['place'][good])
-        return np.concatenate(tables), np.concatenate(places)
+        return concatenate(tables), np.concatenate(places)
 
     def _at_vertices(self, name: str, kind: np.dtype[Any], **fields: str) -> Table:
         """Return events as rows of a type; ``fields``: by column the field of the events."""

@@ -5,7 +5,7 @@ A recording: tables with named columns, and the nodes and callbacks that they re
 
 Theory of operation
 -------------------
-1. Every recording has the same numpy structured arrays.  A reader (``own``,
+1. Every recording has the same tables of named columns (``columns``).  A reader (``own``,
    ``replay.imported_run``, …) builds them once; an analysis is a function of them and does
    not depend on the reader.
 2. Times are int64 nanoseconds on the clock of the recording.  ``UNKNOWN`` (-1) is a time or number
@@ -24,11 +24,12 @@ Theory of operation
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER
+from mddag_executor.recording.columns import rows, Table
 import numpy as np
 import numpy.typing as npt
 
@@ -37,12 +38,9 @@ if TYPE_CHECKING:
     from mddag_executor.recording.head import Head
     from msg_graph import Process, TaskSet
 
-Table = npt.NDArray[Any]
 Ints = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
-_PART = 1 << 16
-"""Rows of a part of a table."""
 UNKNOWN = -1
 """A time or number that is not recorded."""
 ALL_LEGS = -1
@@ -82,66 +80,6 @@ TABLES = {
     'job_ends': JOB_ENDS, 'stops': STOPS, 'takes': TAKES, 'drops': DROPS,
     'losses': LOSSES, 'demotions': DEMOTIONS, 'misses': MISSES}
 """The tables of a recording with the types of their columns."""
-
-
-def rows(kind: np.dtype[Any], length: int = 0, /, **columns: Any) -> Table:
-    """Return a table of a type: the given columns, 0 in the others."""
-    table = np.zeros(length, dtype=kind)
-    for name, values in columns.items():
-        table[name] = values
-    return table
-
-
-def pick(table: Table, which: Any) -> Table:
-    """Return the chosen rows; numpy's own indexing copies column by column, which is slow."""
-    plain = table.view(f'V{table.dtype.itemsize}')
-    found: Table = plain[which].view(table.dtype)
-    return found
-
-
-def in_parts(column: Any) -> Iterator[Any]:
-    """Yield a table or column in parts, as views: temporary arrays of parts stay in the caches."""
-    for begin in range(0, len(column), _PART):
-        yield column[begin:begin + _PART]
-
-
-class Growing:
-    """
-    A table that grows by many rows at a time, in contiguous memory.
-
-    :param values: values of new rows, 0 in the other columns.
-    """
-
-    def __init__(self, kind: np.dtype[Any], **values: int) -> None:
-        self._new = rows(kind, 1, **values).view(f'V{kind.itemsize}')
-        self._rows = self._new[:0].copy()
-        self._kind = kind
-        self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def more(self, n: int) -> Table:
-        """Add rows; return them as a view, which is valid until more are added."""
-        count = self._count + n
-        if count > len(self._rows):
-            self._rows.resize(max(count, 1024, len(self._rows) * 9 // 8), refcheck=False)
-        self._rows[self._count:count] = self._new
-        self._count = count
-        return self.rows()[count - n:]
-
-    def rows(self) -> Table:
-        """Return all rows as a view, which is valid until more are added."""
-        return self._rows[:self._count].view(self._kind)
-
-    def add(self, table: Table) -> None:
-        """Add rows."""
-        self.more(len(table)).view(self._new.dtype)[:] = table.view(self._new.dtype)
-
-    def table(self) -> Table:
-        """Return the table; no rows can be added afterwards."""
-        self._rows.resize(self._count, refcheck=False)
-        return self.rows()
 
 
 @dataclass

@@ -26,9 +26,10 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.core import DEFAULT_DEADLINE_NS
+from mddag_executor.recording.columns import concatenate, rows
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import Recording, RELEASES, rows, sort_by
+from mddag_executor.recording.tables import Recording, RELEASES, sort_by
 from mddag_executor.replay.bags import Bag, BagError
 from mddag_executor.replay.reschedule import Reschedule, reschedule
 from mddag_executor.simulate.workload import check_execution_times
@@ -118,7 +119,7 @@ def read_bag(
                           release=release, noticed=ready))
         if sum(map(len, parts)) > _MOST_JOBS:
             raise _too_many(bag)
-    releases = np.concatenate(parts)
+    releases = concatenate(parts)
     if not len(releases):
         raise BagError(
             bag.name, f'none of the sources of {task_set.file} is in it: it has '

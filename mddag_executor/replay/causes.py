@@ -47,7 +47,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
-from mddag_executor.recording.tables import Ints, Mask, Table
+from mddag_executor.recording.columns import concatenate, Table
+from mddag_executor.recording.columns import rows as table_of
+from mddag_executor.recording.tables import Ints, Mask
 from mddag_executor.replay.spans import Spans
 import numpy as np
 
@@ -267,10 +269,8 @@ def find(
     amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
     causes = _causes(rows, total, amounts, pool, never, is_source)
     which, cause = np.nonzero(times)
-    parts = np.zeros(len(which), dtype=PARTS_OF)
-    for name in ('miss', 'vertex', 'begin', 'end', 'place'):
-        parts[name] = spans[name][which]
-    parts['cause'], parts['ns'] = cause, times[which, cause]
+    parts = table_of(PARTS_OF, len(which), cause=cause, ns=times[which, cause], **{
+        name: spans[name][which] for name in ('miss', 'vertex', 'begin', 'end', 'place')})
     return Found(rows, causes, parts, short)
 
 
@@ -295,13 +295,10 @@ def _spans(rows: Table, chain: Table, is_source: Any, pool: Pool) -> Table:
     everyone = np.arange(n)
 
     def columns(*each: Any) -> Table:
-        table = np.zeros(len(each[0]), dtype=_SPAN)
-        for name, values in zip(_SPAN.names or (), each):
-            table[name] = values
-        return table
+        return table_of(_SPAN, len(each[0]), **dict(zip(_SPAN.names or (), each)))
 
     own = pool.place_of[chain['row']]
-    spans = np.concatenate([
+    spans = concatenate([
         columns(everyone[some], at[begins], np.where(whole, _LAG, _BEFORE),
                 rows['release'][some], ready[begins], 0, own[begins]),
         columns(everyone[~some], rows['at'][~some], _PENDING, rows['release'][~some],
@@ -374,8 +371,8 @@ def _pending(
     waiting = {(vertex, job): (ready, start, group) for vertex, job, ready, start, group in zip(
         *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start', 'group')))}
     before = never.waiting(spans['vertex'][pending], spans['end'][pending])
-    for i, waiting_job in zip(pending.tolist(), before.tolist()):
-        miss, vertex, _, begin, end, *_ = spans[i].item()
+    for i, waiting_job, miss, vertex, begin, end in zip(pending.tolist(), before.tolist(), *(
+            spans[name][pending].tolist() for name in ('miss', 'vertex', 'begin', 'end'))):
         key = vertex, int(rows['job'][miss])
         ready, start, group = waiting.get(key, (end, end, 0))
         waits = ready < end <= start or never.why_dropped(key) == 'aborted'

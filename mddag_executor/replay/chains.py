@@ -35,17 +35,8 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
-from mddag_executor.recording.tables import (
-    EXECUTIONS,
-    Ints,
-    LEG,
-    Mask,
-    pick,
-    rows,
-    rows_by,
-    sort_by,
-    Table,
-)
+from mddag_executor.recording.columns import concatenate, rows, Table
+from mddag_executor.recording.tables import EXECUTIONS, Ints, LEG, Mask, rows_by, sort_by
 from mddag_executor.replay.deadlines import Judged
 from msg_graph import TaskSet
 from msg_graph.model import topological_order
@@ -61,6 +52,9 @@ Columns of a link of a chain.
 completed). Times of the execution: ready, first start, last end, total time of its pieces, waiting
 for the callback group, CPU time (-1: unknown), ns; ``row`` of the execution.
 """
+
+_USED = ['completes', 'leg', 'ready', 'began', 'end', 'busy', 'cpu']
+"""The columns of executions that links have."""
 
 
 class _Chain(NamedTuple):
@@ -136,7 +130,7 @@ class Chains:
         jobs, others = self._judged.jobs[dag], self._others[dag]
         found = jobs.done.T.copy()
         found[~self._started[found]] = -1       # only its completion is recorded
-        table = pick(self._executions, others)
+        table = self._executions[['job', 'vertex', 'start']][others]
         job, vertex = jobs.rows_of(table['job']), table['vertex'] - self._first[dag]
         mine = np.flatnonzero(job >= 0)
         mine = mine[(table['start'][mine] <= jobs.until[job[mine]]) & (
@@ -146,7 +140,7 @@ class Chains:
 
     def _links(self, dag: int, vertex: Any, row: Ints) -> Table:
         """Return executions of vertices as links."""
-        table = pick(self._executions, row)
+        table = self._executions[_USED][row]
         n_legs = np.array([max(1, len(legs)) for legs in self._legs[dag]])[vertex]
         # a sync waits for its other messages
         running = self._is_other[row] & (table['completes'] != LEG)
@@ -234,7 +228,7 @@ class Chains:
         last = np.where(waits, publishers[every, ends.argmax(axis=1)], at)
         which = np.flatnonzero(row[every, last] >= 0)
         found = list(self._follow(dag, which, last[which], missed['row'][which]))
-        return at + self._first[dag], np.concatenate([np.empty(0, dtype=LINKS), *found])
+        return at + self._first[dag], concatenate([rows(LINKS), *found])
 
     # --- breakdown -------------------------------------------------------------------------------
 
@@ -248,7 +242,7 @@ class Chains:
         """Break down the response times of a sink."""
         sink = self._first[dag] + v
         done = self._judged.of_sink(sink)
-        done = pick(done, done['kind'] <= max(SINK_COMPLETED))
+        done = done[done['kind'] <= max(SINK_COMPLETED)]
         if not len(done):
             return
         job, completed, n = done['row'], done['completed'], len(done)

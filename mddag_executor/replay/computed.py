@@ -32,6 +32,8 @@ from mddag_executor.core.state import (
     SINK_DEMOTED,
 )
 from mddag_executor.recording import tables
+from mddag_executor.recording.columns import rows as table_of
+from mddag_executor.recording.columns import Table
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.executions import Numbering
 from mddag_executor.recording.head import Head
@@ -159,7 +161,7 @@ class _Tables:
             found[mine] = np.asarray(recorded, dtype=np.int64)[job[mine]]
         return found
 
-    def in_order(self) -> tuple[tables.Table, tables.Table, tables.Table]:
+    def in_order(self) -> tuple[Table, Table, Table]:
         """Return releases, executions and ends of jobs, with their positions in the order."""
         load, pieces = self._load, self._pieces
         done = np.flatnonzero(pieces.ended & (pieces.dag < self._n_dags))
@@ -210,26 +212,26 @@ class _Tables:
         reasons = np.array([_REASONS[each] for each in how[rows].tolist()], dtype=np.int64)
         return np.array([dag[rows], job[rows], reasons, time[rows]])
 
-    def _releases(self, rows: Ints, order: Ints) -> tables.Table:
+    def _releases(self, rows: Ints, order: Ints) -> Table:
         load = self._load
         dag, times = load.dags[rows], load.times[rows]
-        return tables.rows(
+        return table_of(
             tables.RELEASES, len(rows), dag=dag, job=self._numbers(dag, load.jobs[rows]),
             release=load.releases[rows] if len(load.releases) else times, noticed=times,
             order=order)
 
-    def _job_ends(self, failed: Ints, failures: Ints, early: Ints, order: Ints) -> tables.Table:
+    def _job_ends(self, failed: Ints, failures: Ints, early: Ints, order: Ints) -> Table:
         pieces = self._pieces
         dag, job, reason, time = np.concatenate([np.array(np.broadcast_arrays(
             pieces.dag[failed], pieces.job[failed], tables.FAILED, pieces.end[failed])), early],
             axis=1)
         vertex = np.r_[pieces.vertex[failed], np.full(len(early[0]), UNKNOWN)]
-        found = tables.rows(
+        found = table_of(
             tables.JOB_ENDS, len(dag), dag=dag, vertex=vertex, job=self._numbers(dag, job),
             time=time, reason=reason, order=np.r_[failures, order])
         return found[sort_by(found['order'])]
 
-    def _executions(self, order: Ints) -> tables.Table:
+    def _executions(self, order: Ints) -> Table:
         """
         Return the executions, in the order of their ends.
 
@@ -244,7 +246,7 @@ class _Tables:
         task_set = self._schedule.task_set
         callback = np.r_[np.array(task_set.places_of_vertices(), dtype=np.int64) + 1, 0]
         legs = np.where(Numbering(task_set).n_legs > 1, tables.ALL_LEGS, 0)
-        return tables.pick(tables.rows(
+        return table_of(
             tables.EXECUTIONS, len(first), callback=callback[each.vertex],
             dag=np.where(declared, each.dag, -1), vertex=np.where(declared, each.vertex, -1),
             job=self._numbers(each.dag, each.job), leg=np.where(completes, legs[each.vertex], 0),
@@ -252,7 +254,7 @@ class _Tables:
             ready=self._ready()[first], began=each.start[first], start=each.start,
             end=np.where(ran, each.end, UNKNOWN), busy=np.where(ran, total - before, UNKNOWN),
             completes=np.where(completes, tables.VERTEX, tables.NOTHING), order=order,
-            cpu=UNKNOWN, message=UNKNOWN), rows)
+            cpu=UNKNOWN, message=UNKNOWN)[rows]
 
     def _ready(self) -> Ints:
         """Return by piece when its execution became ready; valid for first pieces."""
@@ -282,7 +284,7 @@ class _Tables:
             ready[rows] = np.maximum(ready[rows], arrived)
         return np.where(ready > -NEVER, np.minimum(ready, each.start), each.start)
 
-    def drops(self) -> tables.Table:
+    def drops(self) -> Table:
         """Return the dropped executions; ``reason``: how their job had ended."""
         kind, dag, vertex, job, end, now = self._decisions
         ended: dict[tuple[int, int], int] = {}
@@ -296,14 +298,14 @@ class _Tables:
             else:
                 ended[dag[row], job[row]] = _DROPS.index(end[row])
         rows = np.array(found, dtype=np.int64)
-        return tables.rows(
+        return table_of(
             tables.DROPS, len(rows), vertex=vertex[rows], job=self._numbers(dag[rows], job[rows]),
             time=now[rows], reason=reasons)
 
-    def demotions(self) -> tables.Table:
+    def demotions(self) -> Table:
         """Return the demotions of sinks."""
         _, dag, vertex, job, _, time = self._decisions[:, self._decisions[0] == SINK_DEMOTED]
-        return tables.rows(tables.DEMOTIONS, len(dag), dag=dag, vertex=vertex,
+        return table_of(tables.DEMOTIONS, len(dag), dag=dag, vertex=vertex,
                            job=self._numbers(dag, job), time=time)
 
     def unsent(self) -> dict[tuple[int, int], Ints]:

@@ -53,18 +53,16 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
+from mddag_executor.recording.columns import concatenate, rows, Table
 from mddag_executor.recording.tables import (
     different,
-    in_parts,
     Ints,
     JobNumbers,
     look_up,
     Mask,
-    pick,
     Recording,
     rows_by,
     sort_by,
-    Table,
 )
 from mddag_executor.text import counted
 from msg_graph.model import optional_edges, topological_order
@@ -80,10 +78,6 @@ Columns of the table of verdicts: one row per judged job and sink, in order.
 ``kind`` is one of the core's decisions; ``completed`` is -1 if the sink never completed; ``until``
 is the time of completion, or of the end of the job; ``row`` is the job's row in ``Jobs``.
 """
-
-_COMPLETIONS = np.dtype([
-    ('row', 'i4'), ('vertex', 'i4'), ('order', 'i4'), ('job', 'i8')])
-"""Columns of a completion: the row of the execution, and some of its columns."""
 
 _NO_JOBS: Ints = np.empty(0, dtype=np.int64)
 _ENDS = {
@@ -131,21 +125,20 @@ class Judged:
         #: The first release that is judged.
         self.judge_from = _judge_from(recording, skip)
         ends, releases = (
-            [pick(table, mine) for mine in rows_by(table['dag'], len(task_set.dags))]
+            [table[mine] for mine in rows_by(table['dag'], len(task_set.dags))]
             for table in (recording.job_ends, recording.releases))
         completions = _completions(
             recording.executions, len(task_set.dags), recording.links)
         self.jobs: list[Jobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
-            completed = np.concatenate(completions.pop(0))
-            jobs, verdicts = self._judge(dag, releases[dag], completed, ends[dag])
+            jobs, verdicts = self._judge(dag, releases[dag], completions.pop(0), ends[dag])
             self.jobs.append(jobs)
             found += verdicts
         give_back()     # memory of the completions
-        table = np.concatenate([np.empty(0, dtype=VERDICTS), *found])
+        table = concatenate([rows(VERDICTS), *found])
         found.clear()
-        self.verdicts = pick(table, sort_by(table['order']))
+        self.verdicts = table[sort_by(table['order'])]
         self.tally = self._tally()
 
     @cached_property
@@ -157,10 +150,9 @@ class Judged:
     # --- judging ---------------------------------------------------------------------------------
 
     def _judge(
-        self, dag: int, released: Table, completions: Table, ends: Table
+        self, dag: int, released: Table, completions: Ints, ends: Table
     ) -> tuple[Jobs, list[Table]]:
-        released = pick(released, sort_by(released['order']))
-        completions = pick(completions, sort_by(completions['order']))
+        released = released[sort_by(released['order'])]
         first, last = self.tables.first_vertex[dag:dag + 2]
         jobs = Jobs(
             released['job'].copy(), released['release'].copy(), released['order'].copy(),
@@ -297,11 +289,11 @@ class Judged:
     def _given_up(self, jobs: Jobs, ends: Table) -> Ints:
         """Note when jobs ended early; return the reason."""
         reason = np.full(len(jobs.number), -1)
-        ends = pick(ends, sort_by(ends['order'])[::-1])
+        ends = ends[sort_by(ends['order'])[::-1]]
         row = jobs.rows_of(ends['job'])
-        row, ends = row[row >= 0], pick(ends, row >= 0)
+        row, ends = row[row >= 0], ends[row >= 0]
         later = ends['order'] > jobs.released[row]
-        row, ends = row[later], pick(ends, later)
+        row, ends = row[later], ends[later]
         # the first end of several wins: it is written last
         jobs.ended[row], jobs.until[row], reason[row] = (
             ends[name] for name in ('order', 'time', 'reason'))
@@ -311,7 +303,7 @@ class Judged:
         """Count ends of jobs that had ended already."""
         if not self._recording.same:
             return
-        ends = pick(ends, ends['reason'] <= recorded.ABORTED)
+        ends = ends[ends['reason'] <= recorded.ABORTED]
         row = jobs.rows_of(ends['job'])
         order, at = ends['order'][row >= 0], row[row >= 0]
         was_open = (order > jobs.released[at]) & (order <= ended[at])
@@ -332,16 +324,16 @@ class Judged:
         return expected
 
     def _complete(
-        self, dag: int, jobs: Jobs, completions: Table, expected: Ints | None, position: Ints
+        self, dag: int, jobs: Jobs, completing: Ints, expected: Ints | None, position: Ints
     ) -> tuple[Ints, Ints]:
         """
         Fill in the executions that completed vertices (rule 1), and their positions.
 
+        :param completing: rows of executions, in order.
         :return: positions of duplicate completions, and the rows of their jobs.
         """
-        first = self.tables.first_vertex[dag]
-        job, order, vertex, completing = (
-            completions[name] for name in ('job', 'order', 'vertex', 'row'))
+        first, ran = self.tables.first_vertex[dag], self._recording.executions
+        job, order, vertex = (ran[name][completing] for name in ('job', 'order', 'vertex'))
         row, vertex = jobs.rows_of(job), vertex - first
         known = row >= 0
         known[known] = order[known] > jobs.released[row[known]]
@@ -435,7 +427,7 @@ class Judged:
 
     def of_sink(self, sink: int) -> Table:
         """Return the verdicts of a sink."""
-        return pick(self.verdicts, self._by_vertex[sink])
+        return self.verdicts[self._by_vertex[sink]]
 
     def differences(self) -> str | None:
         """
@@ -449,7 +441,7 @@ class Judged:
         missed, before = self.missed, self._recording.misses
         columns = ('dag', 'sink', 'job', 'deadline', 'completed')
         found = Counter(zip(*(missed[name].tolist() for name in columns)))
-        recorded = Counter(zip(*(before[name].tolist() for name in before.dtype.names or ())))
+        recorded = Counter(zip(*(before[name].tolist() for name in before.names)))
         if found == recorded:
             return None
         more, less = found - recorded, recorded - found
@@ -468,27 +460,24 @@ def _verdicts(
     row, sink = np.nonzero(which)
     kind, order, until = (
         np.broadcast_to(each, which.shape)[which] for each in (kind, order, until))
-    return recorded.rows(
+    return rows(
         VERDICTS, len(row), kind=kind, dag=dag, sink=np.array(sinks, dtype=np.int64)[sink],
         job=jobs.number[row], release=jobs.release[row], deadline=deadline[which],
         completed=np.where(kind <= max(SINK_COMPLETED), completed[which], -1), until=until,
         row=row, order=order)
 
 
-def _completions(executions: Table, n_dags: int, whole: bool) -> list[list[Table]]:
-    """Return by DAG the completions of vertices, in parts; ``whole``: not those of legs."""
-    found = [[np.empty(0, dtype=_COMPLETIONS)] for _ in range(n_dags)]
-    begin = 0
-    for part in in_parts(executions):
-        completes = part['completes']
-        done = completes == recorded.VERTEX if whole else completes != recorded.NOTHING
-        which = np.flatnonzero(done & (part['vertex'] >= 0))
-        table = recorded.rows(_COMPLETIONS, len(which), row=begin + which, **{
-            name: part[name][which] for name in ('vertex', 'order', 'job')})
-        for parts, mine in zip(found, rows_by(part['dag'][which], n_dags)):
-            parts.append(pick(table, mine))
-        begin += len(part)
-    return found
+def _completions(executions: Table, n_dags: int, whole: bool) -> list[Ints]:
+    """
+    Return by DAG the executions that completed vertices, in the order of their completions.
+
+    :param whole: without those that completed legs.
+    """
+    completes = executions['completes']
+    done = completes == recorded.VERTEX if whole else completes != recorded.NOTHING
+    which = np.flatnonzero(done & (executions['vertex'] >= 0))
+    which = which[sort_by(executions['order'][which])]
+    return [which[mine] for mine in rows_by(executions['dag'][which], n_dags)]
 
 
 def _judge_from(recording: Recording, skip: int) -> int:

@@ -22,17 +22,8 @@ from mddag_executor.core import legs_of, POLICIES
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import (
-    different,
-    in_parts,
-    Ints,
-    Mask,
-    Recording,
-    rows,
-    rows_by,
-    Table,
-    VERTEX,
-)
+from mddag_executor.recording.columns import concatenate, in_parts, rows, Table
+from mddag_executor.recording.tables import different, Ints, Mask, Recording, rows_by, VERTEX
 from mddag_executor.replay.causes import (
     behind,
     CAUSES,
@@ -108,9 +99,8 @@ class Explanation:
     def _missed(self, judged: Judged, chains: Chains) -> tuple[Table, Table]:
         """Return the misses, and the links of their chains."""
         verdicts = judged.missed
-        missed = np.zeros(len(verdicts), dtype=MISSED)
-        for name in ('kind', 'sink', 'job', 'release', 'until'):
-            missed[name] = verdicts[name]
+        missed = rows(MISSED, len(verdicts), **{
+            name: verdicts[name] for name in ('kind', 'sink', 'job', 'release', 'until')})
         demoted = {(vertex, job): time for vertex, job, time in zip(*(
             self._recording.demotions[name].tolist() for name in ('vertex', 'job', 'time')))}
         missed['demoted'] = [demoted.get(key, _NO_END) for key in zip(
@@ -122,7 +112,7 @@ class Explanation:
             missed['at'][mine] = at
             of_dag['of'] = mine[of_dag['of']]
             links.append(of_dag)
-        every = np.concatenate(links) if links else np.empty(0, dtype=LINKS)
+        every = concatenate([rows(LINKS), *links])
         every = every[np.argsort(every['of'], kind='stable')]
         missed['length'] = np.bincount(every['of'], minlength=len(missed))
         return missed, every
@@ -277,7 +267,7 @@ class Explanation:
         sources = rows(STARTED, len(waited), **dict(zip(
             ('vertex', 'job', 'ready', 'start'), zip(*waited))))
         sources['group'] = self._in_groups(sources)
-        return np.concatenate([started, sources])
+        return concatenate([started, sources])
 
     def _in_groups(self, waits: Table) -> Ints:
         """Return how long the callback groups of waiting vertices were busy meanwhile, ns."""

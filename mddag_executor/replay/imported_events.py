@@ -13,7 +13,8 @@ from collections.abc import Callable as Function
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.tables import different, Ints, sort_by, Table
+from mddag_executor.recording.columns import concatenate, rows, Table
+from mddag_executor.recording.tables import different, Ints, sort_by
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import TraceError
@@ -106,18 +107,18 @@ def read_events(
     progress: Function[[int], None] | None = None,
 ) -> Events:
     """Return the events of a trace: those of ``kinds`` as a table, and ``others`` as tuples."""
-    parts: list[Table] = [np.zeros(0, _EVENT)]
+    parts: list[Table] = [rows(_EVENT)]
     tuples: list[tuple[int, Event]] = []
     names_of: dict[tuple[int, int], str] = {}
     count = 0
     for batch in reader.batches({*kinds, *others, *BEFORE_HUMBLE, PROCESS}, as_table=False):
-        for head, rows, places in batch.tables:
+        for head, table, places in batch.tables:
             if head[0].name in BEFORE_HUMBLE:
                 raise TraceError(reader.path, BEFORE_HUMBLE_PROBLEM, BEFORE_HUMBLE_REMEDY)
             if head[0].name in kinds:
-                parts.append(_normal(rows, places, kinds[head[0].name]))
+                parts.append(_normal(table, places, kinds[head[0].name]))
             if head[0].name not in kinds or head[0].name in others:
-                tuples += zip(places.tolist(), (head + row for row in rows.tolist()))
+                tuples += zip(places.tolist(), (head + row for row in table.tolist()))
         for place, event in batch.others:
             layout = event[0]
             if layout.name == PROCESS:
@@ -136,7 +137,8 @@ def read_events(
         count += batch.n_events
         if progress is not None:
             progress(count)
-    table = np.concatenate(parts)
+    table = concatenate(parts)
+    del parts
     table = table[sort_by(table['time'], table['place'])]
     tuples.sort(key=lambda each: (each[1][1], each[0]))
     possible = (table['time'] >= 0) & (table['time'] < NEVER)
@@ -153,15 +155,15 @@ def read_events(
                           for each in threads.tolist()], kept, warning, names_of)
 
 
-def _normal(rows: Table, places: Ints, kind: tuple[Any, ...]) -> Table:
+def _normal(events: Any, places: Ints, kind: tuple[Any, ...]) -> Table:
     """Return events of one kind as rows of the table; missing fields are 0."""
-    found = np.zeros(len(rows), _EVENT)
-    found['time'], found['place'], found['kind'] = rows['timestamp'], places, kind[0]
-    found['thread'] = (rows['vpid'].astype(np.int64) << 32) | (
-        rows['vtid'].astype(np.int64) & 0xFFFFFFFF)
+    found = rows(_EVENT, len(events))
+    found['time'], found['place'], found['kind'] = events['timestamp'], places, kind[0]
+    found['thread'] = (events['vpid'].astype(np.int64) << 32) | (
+        events['vtid'].astype(np.int64) & 0xFFFFFFFF)
     for name, fields in zip('abc', kind[1:]):
         for field in reversed(fields.split()):
-            if field in (rows.dtype.names or ()):
-                value = rows[field].astype(np.int64)
+            if field in (events.dtype.names or ()):
+                value = events[field].astype(np.int64)
                 found[name] = np.where(value != 0, value, found[name])
     return found

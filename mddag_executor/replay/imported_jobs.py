@@ -34,6 +34,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mddag_executor.core import EXPIRE_AFTER_NS, legs_of, Tables
+from mddag_executor.recording.columns import rows, Table
 from mddag_executor.recording.mapping import Target
 from mddag_executor.recording.tables import (
     EXPIRED,
@@ -43,10 +44,8 @@ from mddag_executor.recording.tables import (
     LEG,
     Mask,
     RELEASES,
-    rows,
     rows_by,
     sort_by,
-    Table,
     UNKNOWN,
     VERTEX,
     WITHDRAWN,

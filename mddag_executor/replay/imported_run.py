@@ -29,6 +29,7 @@ import re
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER
 from mddag_executor.memory import give_back
+from mddag_executor.recording.columns import rows, Table
 from mddag_executor.recording.entities import Entities, INIT_EVENTS
 from mddag_executor.recording.head import Head, named_errors, no_run
 from mddag_executor.recording.mapping import Matching
@@ -41,9 +42,7 @@ from mddag_executor.recording.tables import (
     Mask,
     PUBLICATIONS,
     Recording,
-    rows,
     sort_by,
-    Table,
     TAKES,
     UNKNOWN,
 )

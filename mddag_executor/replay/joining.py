@@ -37,6 +37,7 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.errors import UsageError
+from mddag_executor.recording.columns import concatenate, Table
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.executions import Numbering
 from mddag_executor.recording.head import (
@@ -56,11 +57,9 @@ from mddag_executor.recording.tables import (
     JobNumbers,
     Mask,
     NOTHING,
-    pick,
     Recording,
     RowNumbers,
     sort_by,
-    Table,
     TABLES,
     UNKNOWN,
 )
@@ -203,26 +202,26 @@ class _Part:
         is_open[ended[ended >= 0]] = False
         self.open_jobs = list(zip(
             found.releases['dag'][is_open].tolist(), self.number[is_open].tolist()))
-        self._note_ran(pick(table, (row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)))
+        self._note_ran(table[(row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)])
         known = row >= 0
         table['job'][known] = self.number[row[known]]
         for name in ('job_ends', 'misses', 'demotions'):
             table = getattr(found, name)
             row = rows[jobs.of(table)]
             table['job'] = self.number[row] if len(self.number) else UNKNOWN
-            setattr(found, name, pick(table, row >= 0))
+            setattr(found, name, table[row >= 0])
         drops = found.drops     # those of unknown jobs are still counted
         row = rows[jobs.of_jobs(dag_of[drops['vertex']], drops['job'])]
         drops['job'] = np.append(self.number, UNKNOWN)[row]
         new = RowNumbers(kept)
-        found.executions = pick(found.executions, kept)
+        found.executions = found.executions[kept]
         found.releases['job'] = self.number
-        found.releases = pick(found.releases, self.is_first)
+        found.releases = found.releases[self.is_first]
         return new
 
     def _note_ran(self, started: Table) -> None:
         """Note the first and last execution of vertices."""
-        started = pick(started, sort_by(started['vertex'], started['start']))
+        started = started[sort_by(started['vertex'], started['start'])]
         ran = [(int(started['start'][begin]), int(started['vertex'][begin]),
                 int(started['start'][until - 1]))
                for begin, until in zip(*groups(started['vertex']))]
@@ -356,12 +355,12 @@ class Joined:
             of.drops['reason'] = numbers[of.drops['reason']]
             for name in TABLES:
                 table = getattr(of, name)
-                if 'process' in (table.dtype.names or ()):
+                if 'process' in table.names:
                     table['process'] = part.place
         for name in TABLES:
-            setattr(found, name, np.concatenate([getattr(p.recording, name) for p in parts]))
-        found.releases = pick(found.releases, sort_by(found.releases['order']))
-        found.publications = pick(found.publications, sort_by(found.publications['time']))
+            setattr(found, name, concatenate([getattr(p.recording, name) for p in parts]))
+        found.releases = found.releases[sort_by(found.releases['order'])]
+        found.publications = found.publications[sort_by(found.publications['time'])]
         found.drop_reasons = tuple(reasons)
         found.hosted = [
             (int(ranks[place][order]), dag, vertices)

@@ -43,16 +43,9 @@ from collections.abc import Callable as Function
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+from mddag_executor.recording.columns import rows, Table
 from mddag_executor.recording.entities import Addresses, Entities
-from mddag_executor.recording.tables import (
-    different,
-    find_pairs,
-    Ints,
-    last_of,
-    Mask,
-    sort_by,
-    Table,
-)
+from mddag_executor.recording.tables import different, find_pairs, Ints, last_of, Mask, sort_by
 from mddag_executor.replay.imported_events import (
     ADDRESSES,
     BECAME,
@@ -245,7 +238,7 @@ class Links:
         """Return the executions (rule 1)."""
         table = self.events
         begin, end_at = np.array(self._stack(), dtype=np.int64).reshape(-1, 2).T
-        runs = np.zeros(len(begin), _RUN)
+        runs = rows(_RUN, len(begin))
         runs['callback'], runs['at'], runs['end_at'] = self._callback[begin], begin, end_at
         runs['thread'], runs['start'] = table['thread'][begin], table['time'][begin]
         runs['end'] = np.where(end_at >= 0, table['time'][end_at], -1)
@@ -334,7 +327,7 @@ class Links:
         self._row[at] = np.arange(len(at))
         for again in (after_intra, after_rclcpp):
             self._row[again] = self._row[before[again]]
-        found = np.zeros(len(at), _MESSAGE)
+        found = rows(_MESSAGE, len(at))
         found['at'], found['publisher'], found['time'] = at, so_far[at], table['time'][at]
         found['message'], found['within'] = table['b'][at], kind[at] == INTRA
         found['run'] = self._running(publishes)[~joins[publishes]]

@@ -46,15 +46,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.recording import tables as recorded_tables
-from mddag_executor.recording.tables import (
-    in_parts,
-    Ints,
-    look_up,
-    Recording,
-    rows_by,
-    sort_by,
-    Table,
-)
+from mddag_executor.recording.tables import Ints, look_up, Recording, rows_by, sort_by
 from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.spans import crowded, Spans
 from mddag_executor.replay.usage import ran
@@ -156,13 +148,11 @@ class LoadBuilder:
             release[:] = mine['release']
             noticed[:] = np.maximum(mine['release'], mine['noticed'])
         self._note_ends()
-        #: Columns of the executions; by execution the row of its job.
-        self._executions = table = _contiguous(
-            recording.executions, 'dag', 'vertex', 'job', 'piece', 'leg', 'completes', 'order',
-            'worker', 'ready', 'start', 'began', 'end', 'busy', 'cpu', 'holds_gil')
+        self._executions = table = recording.executions
+        #: By execution the row of its job.
         self._row = np.full(len(recording.executions), _UNKNOWN)
-        for jobs, mine in zip(self._numbers, rows_by(table['dag'], len(self._numbers))):
-            self._row[mine] = look_up(jobs, table['job'][mine])
+        for jobs, rows in zip(self._numbers, rows_by(table['dag'], len(self._numbers))):
+            self._row[rows] = look_up(jobs, table['job'][rows])
         self._note_pieces(n_workers)
         self._note_completions()
         self._note_publications()
@@ -570,12 +560,3 @@ class LoadBuilder:
             if len(times):
                 typical[key] = quantile(memoryview(times), 0.5)
         return typical
-
-
-def _contiguous(table: Table, *names: str) -> dict[str, Any]:
-    """Return copies of columns, which are faster to read than those of a table."""
-    found = {name: np.empty(len(table), dtype=table.dtype[name]) for name in names}
-    for part, *columns in zip(in_parts(table), *map(in_parts, found.values())):
-        for name, column in zip(names, columns):
-            column[:] = part[name]
-    return found

@@ -54,6 +54,7 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple
 
+from mddag_executor.recording.columns import concatenate, rows, Table
 from mddag_executor.recording.tables import (
     different,
     EXECUTIONS,
@@ -62,12 +63,9 @@ from mddag_executor.recording.tables import (
     later_pieces,
     look_up,
     Mask,
-    pick,
     Recording,
-    rows,
     rows_by,
     sort_by,
-    Table,
 )
 from mddag_executor.replay.spread import spread
 from msg_graph import Callback, Path, TaskSet
@@ -211,9 +209,9 @@ class Paths:
             found.append(rows(
                 _SENT, len(ended.rows), known=True, run=self._first(ended.rows), time=ended.time,
                 message=self._message(ended.job, self._vertex[ended.rows], topic)))
-        sent = np.concatenate(found)
+        sent = concatenate(found)
         time = sent['time']
-        return pick(sent, sort_by(time)) if (time[1:] < time[:-1]).any() else sent
+        return sent[sort_by(time)] if (time[1:] < time[:-1]).any() else sent
 
     def _recorded(self, callback: Callback, topic: int, mine: Ints) -> Table:
         """Return the recorded publications of a callback among those on a topic."""
@@ -244,7 +242,7 @@ class Paths:
     def _ran(self, callback: Callback) -> tuple[Executions, Ends]:
         """Return the executions of a callback, and the ends of their pieces."""
         rows: Any = self._of_place[self._places[callback.key]]
-        table = pick(self._table, rows)     # once: its rows are scattered over the whole table
+        table = self._table[['start', 'end', 'callback', 'job']][rows]
         started = table['start'] >= 0
         ended = np.flatnonzero(started & (table['end'] >= 0))
         ended = ended[sort_by(table['end'][ended])]
@@ -417,7 +415,7 @@ class _Steps:
 
     def table(self) -> Table:
         """Return the steps as a table of ``STEPS``."""
-        return np.concatenate(self._parts)
+        return concatenate(self._parts)
 
 
 def leaves(steps: Table, last: int) -> Ints:
@@ -444,7 +442,7 @@ def flows_of(steps: Table, last: int) -> Flows:
     found = Flows(*(np.full(len(step), NONE) for _ in Flows._fields))
     flow = np.arange(len(step))
     while len(step):
-        of = pick(steps, step)
+        of = steps[step]
         run, begin, at_last = of['is_run'], of['position'] == 0, of['position'] == last
         for chosen, into, values in (
                 (run & at_last, found.arrival, of['time']), (run & begin, found.begin, of['time']),

@@ -83,7 +83,7 @@ class Reschedule:
     def _scheduled_ns(self) -> int:
         """Return how long callbacks are scheduled: a part has jobs of before its begin, too."""
         begin = self._run.begin
-        return self.settings.duration_ns - min(begin, *self.work.load.times[:1])
+        return self.settings.duration_ns - min([begin, *self.work.load.times[:1]])
 
     def computed(self) -> ComputedRun:
         """Return the schedule as a computed run."""

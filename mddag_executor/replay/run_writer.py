@@ -24,6 +24,7 @@ from typing import Any
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, rad_offsets, Tables
 from mddag_executor.core.tables import ON_LATE
 from mddag_executor.recording import tables
+from mddag_executor.recording.columns import Table
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.deadlines import Judged
 from mddag_executor.simulate import Load, SimulatedRun
@@ -85,7 +86,7 @@ def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
 
 
 def _executions(
-    run: ComputedRun, executions: tables.Table, local: list[int],
+    run: ComputedRun, executions: Table, local: list[int],
     release: dict[tuple[int, int], int], knows_cpu: bool,
 ) -> Iterator[_Entry]:
     load = run.load

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 
+from mddag_executor.recording.columns import rows
 from mddag_executor.recording.entities import INIT_EVENTS
 from mddag_executor.recording.executions import number_pieces
 from mddag_executor.recording.head import no_end
@@ -38,7 +39,6 @@ from mddag_executor.recording.tables import (
     Mask,
     NOTHING,
     Recording,
-    rows,
     rows_by,
     UNKNOWN,
 )

@@ -19,17 +19,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mddag_executor.recording.columns import in_parts, Table
 from mddag_executor.recording.tables import (
     different,
-    in_parts,
     Ints,
     later_pieces,
     NOTHING,
-    pick,
     Recording,
     rows_by,
     sort_by,
-    Table,
     UNKNOWN,
 )
 from mddag_executor.replay.spans import Spans
@@ -39,9 +37,12 @@ NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
          'waiting_group_ns', 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter')
 """The columns of a callback; the last four are of executions with known CPU time."""
 _MEASURED = NAMES.index('measured')
+# Columns of executions that are summed: of all pieces, and of completed executions.
+_TIMES = ['vertex', 'piece', 'ready', 'start', 'end']
+_TOTALS = ['vertex', 'busy', 'cpu', 'holds_gil']
 
 
-def ran(table: Table | Mapping[str, Ints]) -> Ints:
+def ran(table: Table) -> Ints:
     """Return the rows of ``executions`` that have a start and an end, in order of their ends."""
     rows = np.flatnonzero((table['start'] >= 0) & (table['end'] >= 0))
     end = table['end'][rows]
@@ -183,9 +184,9 @@ class Usage:
         table = recording.executions
         for part, wait in zip(in_parts(table), in_parts(waited)):
             ran = (part['start'] >= 0) & (part['end'] >= 0)
-            self._ran(pick(part, ran), wait[ran])
-            self._completed(pick(part, ran & (part['completes'] != NOTHING) & (
-                part['vertex'] >= 0)))
+            self._ran(part[_TIMES][ran], wait[ran])
+            self._completed(part[_TOTALS][ran & (part['completes'] != NOTHING) & (
+                part['vertex'] >= 0)])
         #: How long workers ran declared callbacks, ns.
         self.busy = sum(_busy(worker_spans(
             recording, begin, end, table['vertex'] >= 0)).values())
@@ -215,7 +216,7 @@ class Usage:
         self._most('longest_ns', place, busy)
         known = table['cpu'] >= 0
         if known.any():
-            place, table = place[known], pick(table, known)
+            place, table = place[known], table[known]
             self._add('measured', place)
             self._add('measured_busy_ns', place, table['busy'])
             self._add('cpu_ns', place, table['cpu'])

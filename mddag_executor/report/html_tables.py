@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 
 from mddag_executor.core.tally import counts, total, VERDICTS
-from mddag_executor.recording.tables import Table
+from mddag_executor.recording.columns import Table
 from mddag_executor.report.html_data import ReportData, slack_class
 from mddag_executor.report.replays import callbacks_table, times_table
 from mddag_executor.report.tables import (

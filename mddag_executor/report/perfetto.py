@@ -30,7 +30,7 @@ from typing import Any, BinaryIO
 from mddag_executor.core import legs_of
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import Ints, NOTHING, pick, sort_by, VERTEX
+from mddag_executor.recording.tables import Ints, NOTHING, sort_by, VERTEX
 from mddag_executor.replay import Replay
 from mddag_executor.report.columns import executions
 from mddag_executor.report.protobuf import Bytes, fixed, joined, message, number, texts, where
@@ -119,7 +119,7 @@ class _Writer:
     def _executions(self, rows: Ints) -> None:
         of = self._columns
         order = sort_by(of['start_ns'].values)
-        table = pick(self._recording.executions, rows[order])
+        table = self._recording.executions[rows[order]]
         start, end, declared = table['start'], table['end'], table['vertex'] >= 0
         name, first, release, slack, waiting = (of[key].values[order] for key in (
             'vertex', 'first', 'release_ns', 'slack_ns', 'waiting_ns'))

@@ -4,9 +4,10 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor.recording.columns import rows
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import EXECUTIONS, Recording, rows
+from mddag_executor.recording.tables import EXECUTIONS, Recording
 from mddag_executor.replay import replay
 from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.usage import group_waits, in_groups, PoolUse

@@ -4,7 +4,8 @@
 
 from types import SimpleNamespace
 
-from mddag_executor.recording.tables import EXECUTIONS, rows, UNKNOWN
+from mddag_executor.recording.columns import rows, Table
+from mddag_executor.recording.tables import EXECUTIONS, UNKNOWN
 from mddag_executor.replay import open_recording, replay, ReplayError, reschedule
 from mddag_executor.replay.communications import recorded_callbacks
 from mddag_executor.replay.drafting import System
@@ -335,7 +336,7 @@ def test_releases_of_messages(tmp_path, release_from, stated, response, said):
 
 
 class Counted(np.ndarray):
-    """A table that counts the rows that are read of it."""
+    """A column that counts the rows that are read of it."""
 
     rows = 0
 
@@ -348,7 +349,8 @@ class Counted(np.ndarray):
 def test_callbacks_are_summed_up_in_one_pass():
     number = np.arange(1_000) % 200
     table = rows(EXECUTIONS, 1_000, callback=number, start=1_000, end=np.where(
-        np.arange(1_000) < 10, UNKNOWN, 1_000 + number)).view(Counted)
+        np.arange(1_000) < 10, UNKNOWN, 1_000 + number))
+    table = Table({name: table[name].view(Counted) for name in table.names})
     Counted.rows = 0
     found = recorded_callbacks(SimpleNamespace(
         executions=table, who=SimpleNamespace(name='c{:03}'.format)))

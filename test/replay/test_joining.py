@@ -7,7 +7,8 @@ import json
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
-from mddag_executor.recording.tables import JobNumbers, RELEASES, rows
+from mddag_executor.recording.columns import rows
+from mddag_executor.recording.tables import JobNumbers, RELEASES
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.clocks import offsets
 from mddag_executor.trace import TraceFile

@@ -20,7 +20,7 @@ from ..report import runs
 def same_tables(ours, theirs, times=1):
     """Compare recordings, the jobs of the first of which have other numbers."""
     for name in ('releases', 'executions', 'job_ends'):
-        both = [getattr(each, name).copy() for each in (ours, theirs)]
+        both = [getattr(each, name).records() for each in (ours, theirs)]
         both[1]['job'] *= times
         for table in both:
             if name != 'job_ends':
