@@ -184,7 +184,7 @@ def overtaking_pays(
     compared with the rest of that: if all are late, all would overtake.)
 
     :param held: how long the holder has held the interpreter; ``usual``: its usual duration, ns.
-    :param preempts: whether the holder would be paused instead.
+    :param preempts: whether the holder would pause meanwhile, so that the two share nothing.
     """
     # A holder that takes longer than usual is expected to go on for as long as it is over that.
     left = abs(usual - held)
@@ -194,9 +194,11 @@ def overtaking_pays(
     return first < 0 or PATIENCE * left >= t.rad_offset[s.x_vertex[first]]
 
 
-def overtaking_pays_from(t: Tables, s: State, process: int, usual: int) -> int:
+def overtaking_pays_from(
+    t: Tables, s: State, process: int, usual: int, preempts: bool
+) -> int:
     """Return after which time of holding the interpreter overtaking pays again, ns."""
-    first = first_waiting(t, s, process)
+    first = -1 if preempts else first_waiting(t, s, process)
     wait = 0 if first < 0 else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
     return usual + max(TURN_NS, wait)
 

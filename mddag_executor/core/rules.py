@@ -78,7 +78,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     with the same or a smaller priority holds it.  Until then it is deferred
     (``State.held_back``), and others overtake it.  If it is more urgent than all holders, it
     starts, unless the driver forbids it for the moment (``State.overtaking``, from
-    ``queues.overtaking_pays``: the wait is short).  An execution that lends its worker, is
+    ``queues.overtaking_pays``: the wait is short).  Live, those that it overtakes pause, or share
+    the interpreter with it.  An execution that lends its worker, is
     suspended or turns out to wait (``stop_holding``) holds it no more, and needs it and a worker
     again when it resumes.
 12. **Several processes in virtual time.**  One state can represent all processes of a run

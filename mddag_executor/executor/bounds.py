@@ -21,11 +21,27 @@ The longest that a ready callback waits because another one was expected to end.
 
 It is less if the ready one is urgent: its relative deadline by ``GUARD_PART``, but not less than
 twice the duration of a short callback.
-Setting the time costs 9 us, its expiry about 25 us.  So it is not set if a thread wakes up anyway,
-because the timerfd expires within twice this time.
 """
 
 GUARD_PART = 25
+
+NET_NS = 20_000_000
+"""While a short callback runs longer than expected, arrivals stay unnoticed for this at most."""
+
+LOOK_PART = 4
+"""
+While callbacks compute, a timer or message may stay unnoticed for this part of its deadline.
+
+Each look costs 60 to 140 us.
+"""
+
+SOON_NS = 1_000_000
+"""
+A thread that computes lets another one go on after this (``gil.SWITCH_INTERVAL_S``).
+
+So nothing is looked for sooner, unless it is known when it comes.  A look that is set to a
+later time stays as it is.
+"""
 
 STOP_NS = 5_000_000
 """A wake-up that is late by this, in a process that computes nothing, is a stop of the machine."""

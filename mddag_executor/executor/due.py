@@ -1,38 +1,42 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-When threads wake up: due times, the guard, and muting.
+When threads wake up: due times, and looks.
 
 Theory of operation
 -------------------
-1.  *Due times* are those of timers, deadlines of open jobs, checks, and calls.  One timerfd
-    (``EventLoop.timer``) is set to the earliest.  While there are executions to run, it may expire
-    too early, but not too late.
-2.  *Muting.*  Waking a thread costs 60 to 140 us while a callback computes.  So while a callback
-    holds the GIL for long, callbacks that cannot start wake no thread.  Those that could start are
-    known beforehand: they do not compute, or their relative deadline is below a bound (see
-    ``Engine.overtaking_bound``).  Short callbacks compute, too: each needs the GIL to start.
-    While the bound is at most the relative deadline of undeclared callbacks, the timers of all
-    others do not count for the timerfd, and their sources are switched off (``loop``) if they are
-    *patient*: their relative deadline is at least that of undeclared callbacks.  Their arrivals
-    are collected when muting ends.
+1.  *Due times* are those of timers, deadlines of open jobs, checks, and calls.  While a thread
+    waits in the epoll, its timerfd (``EventLoop.timer``) is set to the earliest.  While there are
+    executions to run, it may expire too early, but not too late.
+2.  *Looks.*  Waking a thread costs 60 to 140 us while a callback computes, so nobody waits for
+    events then.  A parked thread *looks* instead, at the latest time at which anything that may
+    have come would have to start (``Parking.watch``).  A callback that is known to wait has to
+    start at once.  One that computes may wait for a part of its relative deadline
+    (``LOOK_PART``).  Of timers it is known when they are due; messages of other processes may
+    come at any time.  A callback that ends before the look costs no wake-up: the time is set
+    again by the next one, unless it is good enough.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from heapq import heappop, heappush
 from time import monotonic_ns, process_time_ns
 from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER
-from mddag_executor.executor.bounds import AGAIN_NS, SHORT_CALLBACK_NS, STOP_NS
+from mddag_executor.executor.bounds import (
+    AGAIN_NS,
+    GUARD_NS,
+    LOOK_PART,
+    NET_NS,
+    SHORT_CALLBACK_NS,
+    SOON_NS,
+    STOP_NS,
+)
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
-from mddag_executor.executor.listeners import TimerFd
-from mddag_executor.executor.loop import ChannelSource
 from mddag_executor.executor.shutdown import is_over
-from mddag_executor.executor.sources import SubscriptionSource
 
 if TYPE_CHECKING:
     from mddag_executor.executor.workers import WorkerPool
@@ -49,7 +53,11 @@ class DueTimes:
         self._pool = pool
         self._engine = pool.engine
         self._timer = pool.loop.timer
+        self._watch = pool.parking.watch
         self._timers = pool.timers
+        self._timers.allowance = self.allowance
+        # how long an arrival from outside may stay unnoticed while a callback computes
+        self._allowance = NEVER
         self._offset = pool.clock.offset_ns
         self._check_context_at = 0
         self._calls: list[tuple[int, int, Callable[[], None]]] = []
@@ -70,7 +78,7 @@ class DueTimes:
         """Call a function at a time, without the lock."""
         self._n_calls += 1
         heappush(self._calls, (at, self._n_calls, function))
-        self._arm_by(at)
+        self.arm_by(at)
 
     def handle(self, now: int, since: int) -> None:
         """
@@ -92,37 +100,79 @@ class DueTimes:
             self._engine.judge_overdue(now)
         if self._gil_check.at <= monotonic:
             self._check_gil(monotonic)
-        if 0 < pool.muting.until <= now:
-            pool.muting.end()
         while self._calls and self._calls[0][0] <= monotonic:
             pool.deferred.append(heappop(self._calls)[2])
         pool.log_misses()
 
+    def is_due(self, now: int) -> bool:
+        """Return whether there is anything to ``handle``."""
+        timers = self._timers
+        return (timers.has_jumped or timers.next_due() <= now or self._gil_check.at <= now
+                or self._engine.deadlines.next < now + self._offset
+                or bool(self._calls) and self._calls[0][0] <= now)
+
     def arm(self, now: int) -> None:
-        """Set the timerfd to the next due time."""
-        pool = self._pool
-        deadline = self.deadline = self._engine.deadlines.next
+        """Set the time at which a thread wakes up: one in the epoll, else a parked one."""
+        pool, engine = self._pool, self._engine
+        self._timers.has_new = False
+        if not pool.polling and not pool.is_stepping:
+            self._timer.at = NEVER  # it may expire: nobody is woken
+            if pool.running and pool.is_busy():
+                self.look(now)
+            return
+        self.deadline = engine.deadlines.next
         if not pool.running:
             self._timer.arm(NEVER)
             return
-        offset, muting, check = self._offset, pool.muting, self._gil_check
-        self._timers.has_new = False
-        timer = muting.next_timer()
-        first = timer
-        if deadline < NEVER:
-            first = min(first, deadline - offset + 1)
+        first, timer = self._first(now, bool(engine.holders))
+        self.may_expire_early = first != timer
+        if first != self._timer.at:
+            self._timer.arm(first)
+
+    def _first(self, now: int, looks: bool) -> tuple[int, int]:
+        """Return the next due time, or that of a look, and the same of timers only."""
+        engine, check = self._engine, self._gil_check
+        timer = self._timers.next_look() if looks else self._timers.next_due()
+        first = min(timer, self.deadline - self._offset + 1) if self.deadline < NEVER else timer
         if self._calls:
             first = min(first, self._calls[0][0])
-        if muting.until:
-            first = min(first, muting.until - offset)
-        if self._engine.holders and self._engine.has_waiting:
+        if engine.holders and engine.has_waiting:
             self._watch_holder(now)
             first = min(first, self._next_check(now))
         elif check.at < NEVER:
             check.end()
-        self.may_expire_early = first != timer
-        if first != self._timer.at:
-            self._timer.arm(first)
+        return first, timer
+
+    # --- looks -----------------------------------------------------------------------------------
+
+    def allowance(self, entity: Entity, period: int = NEVER) -> int:
+        """Return how long an arrival at an entity may stay unnoticed while a callback computes."""
+        if entity.is_eager():
+            return 0
+        return min(period, self._engine.relative_deadline(entity)) // LOOK_PART
+
+    def expect(self, entity: Entity) -> None:
+        """Note that something may arrive at an entity from outside."""
+        self._allowance = min(self._allowance, max(SOON_NS, self.allowance(entity)))
+
+    def look(self, now: int) -> None:
+        """Set the time of the next look while callbacks run and no thread waits for events."""
+        self.deadline = self._engine.deadlines.next
+        at = min(self._first(now, True)[0], now + self._allowance)
+        if at != self._watch.at:
+            self._watch.arm(at)
+
+    def look_after(self, now: int) -> None:
+        """Set the time of a look in case that a short callback runs longer than expected."""
+        watch = self._watch
+        at = min(self._timers.next_look(), now + NET_NS)
+        if at < watch.at or watch.at < now + GUARD_NS:
+            watch.arm(at)
+
+    def has_looked(self, now: int) -> None:
+        """Note that the time of a look has come."""
+        if self._watch.at <= now:
+            self._watch.at = NEVER
 
     # --- the GIL ---------------------------------------------------------------------------------
 
@@ -140,7 +190,7 @@ class DueTimes:
         self._watch_holder(now, is_late)
         if is_late:
             self._check_gil(now)  # the first reading, with which the next one is compared
-        self._arm_by(self._next_check(now))
+        self.arm_by(self._next_check(now))
 
     def _next_check(self, now: int) -> int:
         """Return when to check whether the first waiting execution may start; NEVER: no need."""
@@ -149,11 +199,14 @@ class DueTimes:
         at = self._engine.overtaking_at() - self._offset
         return min(at if at > now else NEVER, self._gil_check.at)
 
-    def _arm_by(self, at: int) -> None:
-        """Set the timerfd to a time, unless it expires sooner."""
-        if at < self._timer.at:
-            self.may_expire_early = True
-            self._timer.arm(at)
+    def arm_by(self, at: int) -> None:
+        """Let a thread wake up at a time, unless it does sooner."""
+        if self._pool.polling or self._pool.is_stepping:
+            if at < self._timer.at:
+                self.may_expire_early = True
+                self._timer.arm(at)
+        elif at < self._watch.at:
+            self._watch.arm(at)
 
     def _watch_holder(self, now: int, is_late: bool = False) -> None:
         holder = self._engine.interpreter_holder()
@@ -175,6 +228,7 @@ class DueTimes:
         elif self._gil_check.waits(thread.ident, thread.vtid, now):
             self._gil_check.end()
             self._engine.stop_holding(holder)
+            self._pool.end_pauses()
 
     # --- stops of the machine --------------------------------------------------------------------
 
@@ -192,103 +246,3 @@ class DueTimes:
             late = now - max(at, seen, waited) - (cpu - used)
             if late >= STOP_NS:
                 self._engine.verdicts.stopped(now - late + self._offset, now + self._offset)
-
-
-class Guard(ChannelSource):
-    """
-    A time at which to wake a thread because a callback runs longer than expected.
-
-    All methods but ``collect`` need the engine's lock.  The guard has a separate timerfd, which
-    the spinning thread waits for.  Setting and clearing a time for each callback would cost more
-    than the callback (9 us on a virtual machine).  So the time is not cleared until it expires,
-    and changed only to an earlier one.
-
-    :param expired: called when the time expires; it calls ``end``.
-    :ivar at: the time that is set (monotonic ns); NEVER: none.
-    """
-
-    def __init__(self, expired: Callable[[], None]) -> None:
-        self._timer = TimerFd()
-        self.at = NEVER
-        self.fd = self._timer.fd
-        self._expired = expired
-
-    def collect(self) -> None:
-        """Handle the expiry."""
-        self._expired()
-
-    def set(self, at: int) -> None:
-        """Set the time (monotonic ns)."""
-        self.at = at
-        self._timer.arm(at)
-
-    def end(self) -> None:
-        """Note that the time has expired."""
-        self.at = NEVER
-
-    def close(self) -> None:
-        """Close the descriptor, once."""
-        self.fd = -1
-        self._timer.close()
-
-
-class Muting:
-    """
-    The muted sources; all methods need the engine's lock.
-
-    :ivar until: when to stop muting, on the trace's clock; 0: nothing is muted.
-    """
-
-    def __init__(self, pool: WorkerPool) -> None:
-        self.until = 0
-        #: the entities with sources
-        self.entities: Iterable[Entity] = ()
-        # whether a callback has ever held the GIL for long: else nothing is worth a nested epoll
-        self._has_long = False
-        self._bound = 0
-        self._patience = pool.engine.tables.rad_offset[-1]
-        self._pool = pool
-
-    def update(self, now: int) -> None:
-        """Mute sources whose callbacks cannot start while the dispatched one holds the GIL."""
-        if not self._has_long:
-            self._has_long = True
-            for entity in list(self.entities):
-                if entity.classify is not None:
-                    entity.classify()
-        bound, until = self._pool.engine.overtaking_bound(now)
-        if not 0 < bound <= self._patience:
-            self.end()
-        else:
-            self.until, self._bound = until, bound
-            self._pool.loop.mute()
-
-    def end(self) -> None:
-        """End muting, and collect arrivals; timers only if callbacks may start."""
-        if not self.until:
-            return
-        self.until = self._bound = 0
-        for source in self._pool.loop.sources(self._pool.loop.unmute()):
-            source.collect()
-        if self._pool.running:
-            self._pool.fire_timers()
-
-    def classify(self, source: SubscriptionSource) -> None:
-        """Register a source according to its callback's GIL habit and deadline."""
-        entity = source.entity
-        habit = entity.habit
-        if not habit.is_known:
-            return
-        entity.is_nested = habit.computes
-        is_patient = self._pool.engine.relative_deadline(entity) >= self._patience
-        self._pool.loop.move(source, is_patient and self._has_long and bool(habit.computes))
-
-    def next_timer(self) -> int:
-        """Return when the next timer that could start is due (monotonic ns); NEVER: never."""
-        return self._pool.timers.next_due_of(self._could_start) if self.until else (
-            self._pool.timers.next_due())
-
-    def _could_start(self, entity: Entity) -> bool:
-        habit = entity.habit
-        return (not habit.computes or not habit.is_known
-                or self._pool.engine.relative_deadline(entity) < self._bound)

@@ -110,7 +110,7 @@ class Ending:
             self.stepping.close()
         self._pool.loop.close()
         self._at_once.loop.close()
-        self._pool.guard.close()
+        self._pool.parking.close()
         self._signals.close()
 
     def abandon(self) -> None:

@@ -43,10 +43,8 @@ from mddag_executor.core.estimates import note_time
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.overload import admit, inherit_age, is_late
-from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from, PATIENCE, TURN_NS
+from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from
 from mddag_executor.core.state import (
-    DAG_KEYS,
-    DEADLINE_KEYS,
     EXPIRED,
     IDLE,
     JUDGE_FROM,
@@ -130,11 +128,12 @@ class Engine:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
+        #: whether a callback pauses while a more urgent one overtakes it
+        self.pauses = False
         # executions that hold the GIL, in the order in which they began; read-only outside
         self.holders: list[Work] = []
         urgency = self.scheduler.policy.urgency
         self._keys_are_times = urgency != OTHER_KEYS
-        self._keys_are_deadlines = urgency in (DEADLINE_KEYS, DAG_KEYS)
         self._default_deadline = default_deadline
 
     # --- ready work --- --------------------------------------------------------------------------
@@ -447,12 +446,6 @@ class Engine:
         """Return the number of executions that wait, for a worker or for their group."""
         return len(self._lane) + self.scheduler.queue_length
 
-    def waits_since(self, now: int) -> int:
-        """Return since when the most urgent of the ready executions has waited; now: none does."""
-        ready = self._state.ready
-        work = self._lane[0] if self._lane else self._work.get(ready[0][4]) if ready else None
-        return now if work is None else work.ready_ns
-
     def patience(self) -> int:
         """Return how long what is ready may wait for a callback that was expected to end, ns."""
         ready = self._state.ready
@@ -520,13 +513,19 @@ class Engine:
         return work
 
     def relative_deadline(self, entity: Entity) -> int:
-        """Return the least time (ns) from an arrival at an entity to its deadline; -1: unknown."""
+        """Return the least time (ns) from an arrival at an entity to its deadline, or a guess."""
+        rad_offset = self.tables.rad_offset
         if entity.callback is None:
-            return self.tables.rad_offset[self.tables.n_vertices]
-        if entity.source >= 0 and (entity.kind == TIMER or self.jobs.is_released_at_arrival(
-                self.tables.dag_of[entity.source])):
-            return self.tables.rad_offset[entity.source]
-        return -1  # a successor, or a release that lies before the arrival
+            return rad_offset[self.tables.n_vertices]
+        if entity.source >= 0:
+            deadline = rad_offset[entity.source]
+            if entity.kind == TIMER or self.jobs.is_released_at_arrival(
+                    self.tables.dag_of[entity.source]):
+                return deadline
+        else:
+            deadline = min((
+                rad_offset[vertex] for vertex, _ in entity.targets.values()), default=0)
+        return deadline // 2  # its job was released before it arrived
 
     def may_start_more(self, now: int) -> bool:
         """Return whether an idle worker may be able to start an execution; True if in doubt."""
@@ -562,31 +561,13 @@ class Engine:
         work = self.holders[-1]
         return overtaking_pays(
             self.tables, self._state, 1, now - self._state.x_started[work.x],
-            work.entity.habit.mean_ns, False)
+            work.entity.habit.mean_ns, self.pauses)
 
     def overtaking_at(self) -> int:
         """Return when the first waiting execution may overtake the latest holder of the GIL."""
         work = self.holders[-1]
         return self._state.x_started[work.x] + overtaking_pays_from(
-            self.tables, self._state, 1, work.entity.habit.mean_ns)
-
-    def overtaking_bound(self, now: int) -> tuple[int, int]:
-        """
-        Return which arrivals need not be known while the latest execution holds the GIL.
-
-        :return: the least relative deadline (ns) of such arrivals, if they hold the GIL, too, and
-            until when (0, 0: all arrivals have to be known).
-        """
-        if len(self.holders) != 1:
-            return 0, 0
-        work = self.holders[0]
-        left = work.entity.habit.mean_ns - (now - self._state.x_started[work.x])
-        if left < TURN_NS:
-            return 0, 0
-        bound = PATIENCE * left
-        if self._keys_are_deadlines:
-            bound = min(bound, max(0, self._state.x_key[work.x][0] - now))
-        return bound, now + left + max(TURN_NS, bound // PATIENCE)
+            self.tables, self._state, 1, work.entity.habit.mean_ns, self.pauses)
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter: the latest to overtake."""

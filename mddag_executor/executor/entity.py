@@ -10,6 +10,7 @@ import functools
 from typing import Any
 
 from mddag_executor.core import legs_of, Tables
+from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.jobs import new_address
 from msg_graph import Callback, TaskSet
@@ -41,7 +42,7 @@ class Entity:
         'skipped', 'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
         'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
         'publishes', 'at_once', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
-        'collect_more', 'classify', 'is_nested', 'queue', '__weakref__')
+        'collect_more', 'counts_as_eager', 'queue', '__weakref__')
 
     def __init__(
         self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
@@ -100,9 +101,8 @@ class Entity:
         self.most_waiting = 0
         # called when fewer of its executions wait: the middleware may have more
         self.collect_more: Callable_[[], None] | None = None
-        # called when the answer whether it holds the GIL is known or changes; the last answer
-        self.classify: Callable_[[], None] | None = None
-        self.is_nested = 0
+        # whether the pool lets a thread wait for its messages or requests (``is_eager``)
+        self.counts_as_eager = False
         # runs a step in its callback group, if that must be asked (``work.step_in_group``)
         self.gate: Callable_[..., Any] | None = None
         # its mutually exclusive callback group, which is told of each execution
@@ -110,6 +110,15 @@ class Entity:
         self.address = new_address()
         # entered before a callback runs: it raises once the entity is destroyed
         self.handle = rclpy.handle if kind in _HAVE_HANDLES else None
+
+    def is_eager(self) -> bool:
+        """Return whether its callback is known to wait for long, so that it starts at once."""
+        habit = self.habit
+        return bool(habit.is_known and not habit.computes and self.wall_ns > SHORT_CALLBACK_NS)
+
+    def may_come_from_outside(self) -> bool:
+        """Return whether its messages may not come from declared callbacks of this process."""
+        return self.callback is None or self.source >= 0 or bool(self.remote_publishers)
 
     @property
     def symbol(self) -> str:

@@ -204,7 +204,6 @@ class MultiDeadlineExecutor(BareExecutor):
         try:
             self._pool = WorkerPool(self._engine, self._trace_clock, fail, prepare)
             self._at_once = AtOnce(self._pool)
-            self._at_once.loop.add_own(self._pool.guard)
             self._signals = SignalPipe()
             self._at_once.loop.add_own(self._signals)
             self._unclaimed = Unclaimed(fail, self._at_once.ring)

@@ -13,13 +13,19 @@ of this package.  Setting and clearing a listener is synchronous.
 
 An eventfd counts arrivals.  epoll reports each write once (edge-triggered), so the count need not
 be read.
+
+The calls of the hot path keep the GIL (``ctypes.PyDLL``), as none of them blocks: those of ``os``
+and ``select`` give it away, partly under the engine's lock, and then another thread that computes
+keeps it for a switch interval.
 """
 
 from __future__ import annotations
 
 from array import array
 import ctypes
+from functools import cache
 import os
+import platform
 import time
 from typing import Any
 
@@ -27,6 +33,12 @@ from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
 
 _libc = ctypes.PyDLL(None, use_errno=True)  # no call blocks, so the GIL is kept
+# those of the hot path, without errno; ``os`` and ``select`` would let another thread take the GIL
+_quick = ctypes.PyDLL(None)
+_eventfd_write = _quick.eventfd_write
+_eventfd_write.argtypes = [ctypes.c_int, ctypes.c_uint64]
+_eventfd_read = _quick.eventfd_read
+_eventfd_read.argtypes = [ctypes.c_int, ctypes.c_void_p]
 _rcl = ctypes.CDLL('librcl.so')  # rclpy has loaded it
 _WRITE = ctypes.cast(_libc.eventfd_write, ctypes.c_void_p)
 
@@ -60,7 +72,7 @@ _until_next_call.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
 _until_next_call.restype = ctypes.c_int
 
 # without errno and conversions of arguments: half the time, for each timer that is due
-_timer_settime = ctypes.PyDLL(None).timerfd_settime
+_timer_settime = _quick.timerfd_settime
 
 
 class ListenerError(MddagError):
@@ -80,7 +92,7 @@ def set_listener(kind: str, address: int, fd: int) -> None:
     if _SET[kind](address, _WRITE, fd) != 0:
         raise ListenerError(f'{kind}: the middleware cannot announce what arrives: use another '
                             'RMW_IMPLEMENTATION')
-    os.eventfd_write(fd, MANY)
+    announce(fd, MANY)
 
 
 def clear_listener(kind: str, address: int) -> None:
@@ -91,6 +103,65 @@ def clear_listener(kind: str, address: int) -> None:
 def new_eventfd() -> int:
     """Return a new non-blocking eventfd."""
     return os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+
+def announce(fd: int, count: int = 1) -> None:
+    """Add to the count of an eventfd; a closed one is ignored."""
+    _eventfd_write(fd, count)
+
+
+def take_count(fd: int) -> int:
+    """Return the count of an eventfd, and set it to 0; 0 also if it is closed."""
+    count = ctypes.c_uint64()
+    return count.value if _eventfd_read(fd, ctypes.byref(count)) == 0 else 0
+
+
+_IS_PACKED = platform.machine() == 'x86_64'
+
+
+class _EpollEvent(ctypes.Structure):
+    """The kernel's ``epoll_event``, which is packed on x86-64 only."""
+
+    _pack_ = 4 if _IS_PACKED else 8
+    _fields_ = (
+        ('events', ctypes.c_uint32), *(() if _IS_PACKED else (('_', ctypes.c_uint32),)),
+        ('fd', ctypes.c_int32), ('_rest', ctypes.c_uint32))
+
+
+_MOST_EVENTS = 64
+_EPOLL_CTL_MOD = 3
+
+
+@cache
+def _event(events: int, fd: int) -> Any:
+    return ctypes.byref(_EpollEvent(events=events, fd=fd))
+
+
+def change_events(epoll: int, fd: int, events: int) -> None:
+    """Change the events that a descriptor is registered for; errors are ignored."""
+    _quick.epoll_ctl(epoll, _EPOLL_CTL_MOD, fd, _event(events, fd))
+
+
+class Poll:
+    """
+    Asks an epoll, without waiting, what is ready; not for several threads at once.
+
+    :param epoll: its descriptor.
+    """
+
+    __slots__ = ('_epoll', '_found', '_reference')
+
+    def __init__(self, epoll: int) -> None:
+        self._epoll = epoll
+        self._found = (_EpollEvent * _MOST_EVENTS)()
+        self._reference = ctypes.byref(self._found)
+
+    def __call__(self) -> list[tuple[int, int]]:
+        """Return descriptors and events."""
+        count = _quick.epoll_wait(self._epoll, self._reference, _MOST_EVENTS, 0)
+        if count <= 0:
+            return []
+        return [(each.fd, each.events) for each in self._found[:count]]
 
 
 class NextCall:

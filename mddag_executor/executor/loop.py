@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The one place in which idle workers wait: an epoll over all events.
+The two places in which idle threads wait: an epoll over all events, and one over none of them.
 
 Theory of operation
 -------------------
@@ -11,11 +11,7 @@ Theory of operation
 2.  *Waiting.*  All descriptors are registered edge-triggered in one epoll.  However many workers
     wait, the kernel wakes exactly one for each event.  ``wake`` wakes one more.
 3.  *Time.*  One timerfd is set to the earliest time at which anything has to be done.
-4.  *Muting.*  No thread is woken for a callback that cannot start.  While a callback holds the GIL
-    for long, messages for callbacks that hold it too and have more time than the running one needs
-    stay in the middleware.  So the sources of *patient* callbacks (see ``due``) are in a nested
-    epoll.  ``mute`` switches it off, with one system call; ``unmute`` switches it on again and
-    returns the arrivals.
+4.  *Parking.*  Threads that are not to be woken by events wait in ``Parking``, a second epoll.
 5.  Descriptors of removed sources are used again and closed only at the end.  If an entity is
     being destroyed concurrently, its listener may write once more; that wake-up is spurious.
 """
@@ -29,7 +25,14 @@ import os
 import resource
 import select
 
-from mddag_executor.executor.listeners import new_eventfd, TimerFd
+from mddag_executor.executor.listeners import (
+    announce,
+    change_events,
+    new_eventfd,
+    Poll,
+    take_count,
+    TimerFd,
+)
 
 _EDGE = select.EPOLLIN | select.EPOLLET
 
@@ -59,12 +62,10 @@ class ChannelSource:
     Anything that announces arrivals by a descriptor.
 
     :ivar fd: the descriptor, -1: none.
-    :ivar is_patient: whether it is registered in the nested epoll.
     :ivar is_counted: the descriptor is not shared, so its count is the number of arrivals.
     """
 
     fd = -1
-    is_patient = False
     is_counted = False
 
     def collect(self) -> None:
@@ -75,7 +76,7 @@ class ChannelSource:
 class EventLoop:
     """An epoll with its channels; all methods but ``wait`` and ``wake`` need one lock."""
 
-    _bell = _leave = -1
+    _bell = _leave = _epoll_fd = -1
 
     def __init__(self) -> None:
         self._free: list[int] = []
@@ -89,14 +90,14 @@ class EventLoop:
         self._epoll = select.epoll()
         #: waits for events until the timeout (s; -1: for ever), and returns them
         self.wait: Callable[..., Events] = self._epoll.poll
-        self._nested = select.epoll()
-        self._nested_fd = self._nested.fileno()
+        self._epoll_fd = self._epoll.fileno()
+        #: returns events without waiting; needs the lock
+        self.poll: Callable[[], Events] = Poll(self._epoll_fd)
         self.timer = TimerFd()
         self._bell = new_eventfd()
         self._leave = new_eventfd()
         self._epoll.register(self.timer.fd, _EDGE)
         self._epoll.register(self._bell, _EDGE)
-        self._epoll.register(self._nested_fd, _EDGE)
         self._channels: dict[int, tuple[ChannelSource, ...]] = {}
         self._shared: dict[str, int] = {}
         # a quarter of the descriptors that the process may open
@@ -118,7 +119,6 @@ class EventLoop:
         """
         if not share and len(self._channels) >= self._budget:
             share = 'the rest'
-        source.is_patient = False
         source.is_counted = not share
         if share in self._shared:
             source.fd = self._shared[share]
@@ -143,23 +143,13 @@ class EventLoop:
             self._channels[fd] = rest
             return
         del self._channels[fd]
-        self._home(source).unregister(fd)
+        self._epoll.unregister(fd)
         self._shared = {name: each for name, each in self._shared.items() if each != fd}
         self._free.append(fd)
 
     def has(self, source: ChannelSource) -> bool:
         """Return whether a source is one of this loop."""
         return source in self._channels.get(source.fd, ())
-
-    def move(self, source: ChannelSource, is_patient: bool) -> None:
-        """Let ``mute`` apply to a source from now on, or no more."""
-        if source.fd >= 0 and source.is_patient != is_patient:
-            self._home(source).unregister(source.fd)
-            source.is_patient = is_patient
-            self._home(source).register(source.fd, _EDGE)  # reports earlier arrivals
-
-    def _home(self, source: ChannelSource) -> select.epoll:
-        return self._nested if source.is_patient else self._epoll
 
     def hold(self, sources: Iterable[ChannelSource]) -> None:
         """Stop wake-ups for some sources until ``release``; from any thread, without the lock."""
@@ -171,57 +161,35 @@ class EventLoop:
 
     def _set_mask(self, sources: Iterable[ChannelSource], mask: int) -> None:
         for source in sources:
-            fd, epoll = source.fd, self._home(source)
-            try:
-                epoll.modify(fd, mask)
-                if source.fd != fd:  # removed just now: another source may have its descriptor
-                    epoll.modify(fd, _EDGE)
-            except (OSError, ValueError):
-                pass  # it was removed or moved just now
+            fd = source.fd
+            change_events(self._epoll_fd, fd, mask)
+            if source.fd != fd:  # removed just now: another source may have its descriptor
+                change_events(self._epoll_fd, fd, _EDGE)
 
     def announce(self, source: ChannelSource, count: int = 1) -> None:
         """Announce a source again, as if ``count`` more messages had arrived."""
-        if source.fd >= 0:
-            os.eventfd_write(source.fd, count)
+        announce(source.fd, count)
 
     # --- waiting ---------------------------------------------------------------------------------
 
     def sources(self, events: Events) -> Iterator[ChannelSource]:
         """Yield the sources with arrivals."""
         for fd, _ in events:
-            if fd == self._nested_fd:
-                yield from self.sources(self._nested.poll(0))
-            else:
-                yield from self._channels.get(fd, ())
+            yield from self._channels.get(fd, ())
 
     def wake(self) -> None:
         """Wake one waiting thread; from any thread, also after ``close``."""
-        try:
-            os.eventfd_write(self._bell, 1)
-        except (OSError, ValueError):
-            pass
+        announce(self._bell)
 
     def wake_all(self) -> None:
         """Wake all waiting threads, and let no thread wait until ``let_wait``."""
-        os.eventfd_write(self._leave, 1)
+        announce(self._leave)
         self._epoll.register(self._leave, select.EPOLLIN)
 
     def let_wait(self) -> None:
         """End ``wake_all``: threads may wait again."""
         self._epoll.unregister(self._leave)
-        os.eventfd_read(self._leave)
-
-    # --- muting ----------------------------------------------------------------------------------
-
-    def mute(self) -> None:
-        """Stop wake-ups for the sources of patient callbacks."""
-        self._epoll.modify(self._nested_fd, 0)
-
-    def unmute(self) -> Events:
-        """End muting; return the arrivals meanwhile, so that no thread is woken for them."""
-        found = self._nested.poll(0)
-        self._epoll.modify(self._nested_fd, _EDGE)
-        return found
+        take_count(self._leave)
 
     def close(self) -> None:
         """
@@ -230,13 +198,61 @@ class EventLoop:
         Descriptors of sources that still have a listener stay open: it may write to them.
         """
         fds = [*self._free, self._bell, self._leave]
-        self._bell = self._leave = -1
+        self._bell = self._leave = self._epoll_fd = -1
         self._free.clear()
-        self.wait = lambda *_: []
+        self.wait = self.poll = lambda *_: []
         for fd in fds:
             if fd >= 0:
                 os.close(fd)
-        for name in ('timer', '_epoll', '_nested'):
+        for name in ('timer', '_epoll'):
+            if hasattr(self, name):  # else it could not be opened
+                getattr(self, name).close()
+
+    def __del__(self) -> None:
+        """Close the descriptors of an executor that was never shut down."""
+        self.close()
+
+
+class Parking:
+    """
+    Where threads wait that no event is to wake: one at a time wakes, for a call or the watch.
+
+    :ivar watch: a timerfd, set to the time at which one of them is to look.
+    """
+
+    _bell = _end = -1
+
+    def __init__(self) -> None:
+        try:
+            self._epoll = select.epoll()
+            #: waits, and returns what has woken the thread
+            self.wait: Callable[[], Events] = self._epoll.poll
+            self.watch = TimerFd()
+            self._bell = new_eventfd()
+            self._end = new_eventfd()
+            for fd in (self.watch.fd, self._bell):
+                self._epoll.register(fd, _EDGE)
+            self._epoll.register(self._end, select.EPOLLIN)
+        except BaseException:  # too many open files
+            self.close()
+            raise
+
+    def call(self) -> None:
+        """Wake one thread."""
+        announce(self._bell)
+
+    def end(self) -> None:
+        """Wake all threads, and let no thread wait any more; from any thread."""
+        announce(self._end)
+
+    def close(self) -> None:
+        """Close all descriptors, once; no thread waits any more."""
+        fds = self._bell, self._end
+        self._bell = self._end = -1
+        for fd in fds:
+            if fd >= 0:
+                os.close(fd)
+        for name in ('watch', '_epoll'):
             if hasattr(self, name):  # else it could not be opened
                 getattr(self, name).close()
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-import os
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor import compat
@@ -25,7 +24,7 @@ from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gaps import Gaps
 from mddag_executor.executor.jobs import Publication, stamped_release
-from mddag_executor.executor.listeners import clear_listener, MANY, set_listener
+from mddag_executor.executor.listeners import clear_listener, MANY, set_listener, take_count
 from mddag_executor.executor.loop import ChannelSource, EventLoop
 from mddag_executor.executor.work import Work
 from rclpy.exceptions import InvalidHandle
@@ -84,7 +83,9 @@ class Source(EntitySource):
         entity, take = self.entity, self._take
         try:
             if not left:
-                left = os.eventfd_read(self.fd) if self.is_counted else MANY
+                left = take_count(self.fd) if self.is_counted else MANY
+                if not left:
+                    return  # another thread has collected it
             if entity.removed:
                 return  # another executor may have it now
             for _ in range(left if left < MOST else MOST):
@@ -100,8 +101,6 @@ class Source(EntitySource):
             if not compat.alive(entity.rclpy):
                 return
             self._fail(error)
-        except BlockingIOError:
-            return  # another thread has collected it
         except Exception as error:
             if self.fd < 0:
                 return  # it was just removed
@@ -191,10 +190,9 @@ class SubscriptionSource(Source):
 
         :return: whether there was any arrival.
         """
-        try:
-            announced = os.eventfd_read(self.fd)
-        except (OSError, ValueError):  # nothing was announced, or it was just removed
-            return False
+        announced = take_count(self.fd)
+        if not announced:
+            return False  # nothing was announced, or it was just removed
         if announced > 1 or self.entity.most_waiting:
             self.collect(announced)
             return True

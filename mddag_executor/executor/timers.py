@@ -25,6 +25,7 @@ from functools import partial
 from heapq import heapify, heappop, heappush
 import time
 from typing import Any
+import weakref
 
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core import NEVER
@@ -141,6 +142,10 @@ class TimerQueue:
         self._on_error = on_error
         self._timers: dict[int, TimerSource] = {}
         self._heap: list[tuple[int, int, TimerSource]] = []
+        # the same by the time at which each may be noticed at the latest
+        self._looks: list[tuple[int, int, weakref.ref[TimerSource]]] = []
+        #: returns how long a timer with a period may stay unnoticed while a callback computes
+        self.allowance: Callable[[Entity, int], int] = lambda *_: 0
         self._entries = 0
         self._jumps: dict[int, tuple[Clock, JumpHandle]] = {}
         self.has_jumped = self.has_new = False
@@ -202,10 +207,17 @@ class TimerQueue:
             heappop(heap)
         return heap[0][0] if heap else NEVER
 
-    def next_due_of(self, wanted: Callable[[Entity], bool]) -> int:
-        """Return when to ``fire`` next for the wanted timers (monotonic ns), or NEVER."""
-        return min((due for due, entry, source in self._heap
-                    if source.entry == entry and wanted(source.entity)), default=NEVER)
+    def next_look(self) -> int:
+        """Return when to ``fire`` at the latest while a callback computes (monotonic ns)."""
+        looks = self._looks
+        while looks and not self._is_valid(looks[0]):
+            heappop(looks)
+        return looks[0][0] if looks else NEVER
+
+    @staticmethod
+    def _is_valid(look: tuple[int, int, weakref.ref[TimerSource]]) -> bool:
+        source = look[2]()
+        return source is not None and source.entry == look[1]
 
     def ask(self, source: TimerSource) -> None:
         """Ask rcl when a timer is due that is new or was reset."""
@@ -232,10 +244,17 @@ class TimerQueue:
         self._entries += 1
         source.due, source.entry = due, self._entries
         heappush(self._heap, (due, self._entries, source))
+        heappush(self._looks, (
+            due + self.allowance(source.entity, source.last_period), self._entries,
+            weakref.ref(source)))
         self.has_new = True
-        if len(self._heap) > 2 * len(self._timers) + 8:  # after many resets
+        most = 2 * len(self._timers) + 8  # more after many resets
+        if len(self._heap) > most:
             self._heap = [each for each in self._heap if each[2].entry == each[1]]
             heapify(self._heap)
+        if len(self._looks) > most:
+            self._looks = [each for each in self._looks if self._is_valid(each)]
+            heapify(self._looks)
 
     def fire(self) -> Iterator[Fired]:
         """Yield the due timers, each once, including those that become due meanwhile."""

@@ -75,7 +75,6 @@ class Upkeep:
         self._lock = threading.RLock()
         self._refresh_at = 0.0
         self._sources: dict[Entity, Source | TimerSource | WaitableSource] = {}
-        pool.muting.entities = self._sources
         self._deliveries: dict[str, publishing.LocalDelivery] = {}
         self._events: WaitableSource | None = None
         self._unlistened: list[Entity] = []
@@ -180,6 +179,8 @@ class Upkeep:
             source = ClientSource(entity, at_once)
         else:
             return
+        if entity.kind in (SUBSCRIPTION, SERVICE) and entity.may_come_from_outside():
+            pool.due.expect(entity)
         loop.add(source, share)
         self._sources[entity] = source
         try:
@@ -189,7 +190,6 @@ class Upkeep:
         if isinstance(source, SubscriptionSource) and source.is_counted:
             before = self._deliveries.get(entity.label)
             self._deliver(entity.label, (*(before.sources if before else ()), source))
-            entity.classify = partial(pool.muting.classify, source)
 
     def _deliver(self, topic: str, sources: tuple[SubscriptionSource, ...]) -> None:
         """Let publishing threads of this process collect for these subscriptions of a topic."""
@@ -209,7 +209,7 @@ class Upkeep:
             self._sources[entity] = source  # later, without the lock
         if source is None or isinstance(source, WaitableSource):
             return
-        entity.classify = None
+        self._pool.forget_eager(entity)
         source.ignore()
         for loop in (self._pool.loop, self._at_once.loop):
             if loop.has(source):

@@ -9,19 +9,21 @@ Theory of operation
     next one: all in one section under one lock.  If there is none, the thread waits in the epoll
     (``loop``).  When it wakes, it collects the arrivals and asks again.  The kernel wakes exactly
     one thread for each event.
-2.  *No event is overlooked.*  When no thread waits in the epoll, a thread that has more to run
+2.  *Who waits for events.*  As a rule one thread (``ThreadState.WAITING``); all others are
+    *parked*.  While a callback computes, nobody does: the thread that runs it goes on with what
+    comes first when it ends, and a parked one *looks* now and then (``due``).  If anything may
+    start then, because it is urgent or waits, that thread runs it.  So callbacks that compute are
+    run by one thread, one after the other, and no other thread is woken in vain.  A callback that
+    is known to wait (for a server, a disk, a sleep) leaves the events to another thread.  While
+    messages or requests may come for such a callback (``Entity.is_eager``), somebody always waits.
+3.  *No event is overlooked.*  When no thread waits in the epoll, a thread that has more to run
     polls it first, every ``SHORT_CALLBACK_NS``.  So an urgent arrival is known before the next
     choice.
-3.  *Waking others.*  If more than one execution may start, one waiting thread is woken, which does
-    the same.  No thread is woken while a *short* callback runs, because its thread will be free in
+4.  *Waking others.*  If more than one execution may start, one thread is called, which does the
+    same.  No thread is called while a *short* callback runs, because its thread will be free in
     time.  A callback is short if it usually ends within ``SHORT_CALLBACK_NS`` of its start or of a
-    publication that it has made.  If it runs longer, the guard (``due``) wakes another thread.
-4.  *Admission to the epoll.*  A spin begins with one waiting thread.  Another one is admitted when
-    an execution starts and no thread waits.  All other threads are parked, each on its own lock,
-    which is released exactly once for each admission.  A thread that wakes for an execution that
-    the thread of a short callback will run is parked again.  So if arrivals are dense, one thread
-    does everything, and none waits in the epoll until the guard expires.
-5.  *Time*, and the arrivals not announced while a callback holds the GIL, are in ``due``.
+    publication that it has made.  If it runs longer, a parked thread looks.
+5.  *Time* is in ``due``.
 6.  *Lending.*  A callback that waits inside ``Client.call`` returns its worker to the core.  If
     fewer threads are left than there are workers, a thread is made.  At most ``MOST`` callbacks
     lend at the same time; further ones keep their workers.  When it has its answer, it *rejoins*:
@@ -40,7 +42,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
+from enum import Enum
 from functools import partial
 import threading
 from time import monotonic_ns, process_time_ns
@@ -48,7 +51,6 @@ from typing import Any, TYPE_CHECKING
 import weakref
 
 from mddag_executor.clocks import TraceClock
-from mddag_executor.core.queues import TURN_NS
 from mddag_executor.core.tables import NEVER
 from mddag_executor.errors import from_user_code
 from mddag_executor.executor.bounds import (
@@ -60,14 +62,16 @@ from mddag_executor.executor.bounds import (
     SHORT_CALLBACK_NS,
 )
 from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN, QuickCallback
-from mddag_executor.executor.debugging import engine_lock
-from mddag_executor.executor.due import DueTimes, Guard, Muting
+from mddag_executor.executor.debugging import engine_lock, InvariantError
+from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.ending import weakly
 from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.jobs import PublisherState
-from mddag_executor.executor.loop import EventLoop, Events
+from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
+from mddag_executor.executor.pausing import can_pause, Pause
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
 from mddag_executor.executor.work import current, Destroyed, Refused, Work
@@ -84,18 +88,52 @@ def _nothing() -> None:
     pass
 
 
+class ThreadState(Enum):
+    """
+    What a thread does; it changes under the engine's lock only.
+
+    ::
+
+                  called, or looks, and finds an execution
+            ┌───────────────────────────────────────────────▶┐
+          PARKED ◀──────────────────────────────────────── RUNNING ──▶ OUT
+            │ ▲   nothing to run: others wait or compute     ▲ │ ▲       │
+            │ │                                              │ │ └───────┘ answer, and its turn
+            ▼ │                                    an event, │ │
+          WAITING ◀──────────────────────────────────────────┴─┘ nothing to run
+
+    A thread of the pool begins and ends as PARKED, that of ``spin_once`` as RUNNING.
+    """
+
+    PARKED = 'parked'       # waits to be called, or for the time of a look
+    WAITING = 'waiting'     # waits for events
+    RUNNING = 'running'     # runs a callback
+    OUT = 'out'             # runs one that has lent its worker, and waits or waits for its turn
+
+
+_NEXT = {
+    ThreadState.PARKED: {ThreadState.WAITING, ThreadState.RUNNING},
+    ThreadState.WAITING: {ThreadState.PARKED, ThreadState.RUNNING},
+    ThreadState.RUNNING: {ThreadState.PARKED, ThreadState.WAITING, ThreadState.OUT},
+    ThreadState.OUT: {ThreadState.RUNNING, ThreadState.PARKED, ThreadState.WAITING},
+}
+"""Which states may follow; a thread that stays in one does not change."""
+
+
 class WorkerThread:
     """
     A thread that runs callbacks.
 
     :ivar work: the running execution.
     :ivar worker: the number of its last worker in the core.
-    :ivar permit: a lock, released to admit the thread to the epoll, or to let its callback go on.
+    :ivar state: what it does; ``WorkerPool.become`` changes it.
+    :ivar permit: a lock, released to let its callback go on.
     :ivar has_lent: whether its callback has returned its worker at any time; ``is_out``: whether
         it has none now; ``waits``: whether it still waits for what it lent its worker for.
     :ivar measurement: of its running callback; None: it is not measured.
-    :ivar waits_since: since when it has waited in the epoll, on the trace's clock; 0: it does not.
-    :ivar is_parked: whether it waits for its permit.
+    :ivar pause: the pause of the callback that it has just overtaken.
+    :ivar waits_since: since when it has waited in the epoll, on the trace's clock.
+    :ivar is_spare: whether its last callback has left the events to another thread.
     :ivar published: when the running callback first published (monotonic ns); 0: not yet.
     :ivar start: when the execution that has just ended began; ``end``: when it ended (on the
         trace's clock).
@@ -104,8 +142,8 @@ class WorkerThread:
     """
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
-                 'is_parked', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
-                 'waits_since', 'is_out', 'measurement')
+                 'state', 'is_spare', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
+                 'waits_since', 'is_out', 'measurement', 'pause')
 
     def __init__(self, pool: WorkerPool, thread: threading.Thread | None) -> None:
         self.pool = pool
@@ -118,7 +156,9 @@ class WorkerThread:
         self.vtid = self.ident = 0
         self.waits = self.has_lent = self.is_out = False
         self.measurement: Measurement | None = None
-        self.is_parked = True
+        self.pause: Pause | None = None
+        self.is_spare = False
+        self.state = ThreadState.RUNNING if thread is None else ThreadState.PARKED
         self.published = self.start = self.end = self.waits_since = 0
         self.outcome: Any = None
 
@@ -184,11 +224,15 @@ class WorkerPool:
         #: functions to call when the calling thread does not own the lock
         self.deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
+        self.parking = Parking()
         self.announcements: Announcements | None = None
         self.timers = TimerQueue(self.loop.wake, fail)
         self.running = False
         self.stopped_at = 0
         self.is_current = False
+        # those that are overtaken, by their executions
+        self._pauses: dict[Work, Pause] = {}
+        engine.pauses = can_pause()
         self.lent = 0
         # the threads of executions that have lent their workers, and wait to go on
         self._rejoining: dict[Work, WorkerThread] = {}
@@ -203,29 +247,26 @@ class WorkerPool:
         self._miss_log = MissLog(engine.verdicts)
         self._prepare_thread = prepare_thread
         self._threads: list[WorkerThread] = []
-        self._parked: list[WorkerThread] = []
         self._visitors: list[WorkerThread] = []
+        #: how many threads wait for events
         self.polling = 0
+        self._n_parked = 0
+        # how many callbacks are known to wait for whom messages or requests may come
+        self._eager = 0
         self._polled_at = 0  # when the epoll was last polled
         self._waiting_calls = 0
-        self._bell_rings = False
+        self._bell_rings = self._has_called = False
         self._closed = False
         self._at_end: Callable[[], None] = _nothing
         self._leaving = False
         self._all_left = threading.Event()
-        self._is_stepping = False
+        #: whether the thread of a ``spin_once`` runs everything
+        self.is_stepping = False
         # coroutines that have yielded: they continue in the next step
         self._of_next_step: list[Work] = []
         self._loops: Loops | None = None
         self.now = 0
-        # the thread that last dispatched a short callback
-        self._leader: WorkerThread | None = None
-        # what it ran when the guard was set
-        self._guarded: Work | None = None
-        self.muting = Muting(self)
         self.due = DueTimes(self)
-        #: wakes a thread when a short callback runs longer than expected
-        self.guard = Guard(self._guard_expired)
 
     def loops(self) -> Loops:
         """Return the event loops of coroutines, made for the first one."""
@@ -311,60 +352,46 @@ class WorkerPool:
         """Wake a thread if an idle worker may start an execution; the caller holds the lock."""
         if not self.running:
             return
-        running = current.running
+        engine, running = self.engine, current.running
         if running is not None and running.pool is self and running.is_short():
-            self._guard(self.now - self._offset)
-        elif self.engine.may_start_more(self.now):
-            self._wake_one()
-        elif self.engine.holders and self.engine.idle_workers and self.engine.has_waiting:
+            if engine.idle_workers:
+                rest = engine.patience()
+                # if something computes, it is not known yet whether it does
+                self.due.arm_by(
+                    monotonic_ns() + (rest // 2 if engine.holders else rest))
+        elif engine.may_start_more(self.now):
+            self._call()
+        elif engine.holders and engine.idle_workers and engine.has_waiting:
             self.due.check_holder(monotonic_ns())
 
-    def _guard(self, now: int) -> None:
-        """Let a thread start what waits if a short callback runs longer than expected."""
-        guard, rest = self.guard, self.engine.patience()
-        if self.engine.holders:
-            rest //= 2  # then it is not known yet whether that computes
-        if self.engine.idle_workers and guard.at > now + rest and not (
-                self.polling and self.loop.timer.at <= now + 2 * rest):
-            self._guarded = None if self._leader is None else self._leader.work
-            guard.set(now + rest)
-
-    def _guard_expired(self) -> None:
-        """
-        Wake a thread because a short callback runs longer than expected.
-
-        As long as short callbacks end in time, and the ready ones do not wait, none is woken.
-        """
-        with self.lock:
-            now = self.tick()
-            self.guard.end()
-            leader, self._leader = self._leader, None
-            if not self.running:
-                return
-            if (leader is not None and leader.is_short() and leader.work is not self._guarded
-                    and self.engine.waits_since(now) > now - self.engine.patience()):
-                self._leader = leader
-                self._guard(now - self._offset)
-            elif self.engine.may_start_more(now):
-                self._wake_one()
-            else:
-                if not self.polling:
-                    self._admit()
-                if self.engine.holders and self.engine.has_waiting:
-                    self.due.check_holder(now - self._offset, is_late=True)
-
-    def _wake_one(self) -> None:
-        if self.polling or self._is_stepping:
+    def _call(self) -> None:
+        """Wake a thread, which starts what may start, or waits for events."""
+        if self.polling or self.is_stepping:
             if not self._bell_rings:
                 self._bell_rings = True
                 self.loop.wake()
-        else:
-            self._admit()
+        elif self._n_parked and not self._has_called:
+            self._has_called = True
+            self.parking.call()
 
-    def _admit(self) -> None:
-        """Let one more thread wait in the epoll; the caller holds the lock."""
-        if self._parked and self.running and not self._is_stepping:
-            self._parked.pop().permit.release()
+    def is_busy(self) -> bool:
+        """Return whether any execution runs on a worker."""
+        return self.engine.idle_workers < self.engine.n_workers
+
+    def note_eager(self, entity: Entity) -> None:
+        """Note whether a thread must wait for an entity's messages or requests, at any time."""
+        is_eager = entity.is_eager() and entity.kind in (SUBSCRIPTION, SERVICE)
+        if is_eager != entity.counts_as_eager:
+            with self.lock:
+                if is_eager != entity.counts_as_eager and not entity.removed:
+                    entity.counts_as_eager = is_eager
+                    self._eager += 1 if is_eager else -1
+
+    def forget_eager(self, entity: Entity) -> None:
+        """End ``note_eager`` for an entity that is removed; the caller holds the lock."""
+        if entity.counts_as_eager:
+            entity.counts_as_eager = False
+            self._eager -= 1
 
     # --- threads ---------------------------------------------------------------------------------
 
@@ -375,21 +402,21 @@ class WorkerPool:
             if self._closed:
                 return
             self.running = True
-            self._is_stepping = False
+            self.is_stepping = False
             self.stopped_at = 0
             self.due.begin(self.tick() - self._offset)
             self.engine.verdicts.stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:
                 self._new_thread()
             # one that did not leave after the last spin (``pause``) is asleep, and not parked
-            self._wake_one()
+            self._bell_rings = self._has_called = False
+            self._call()
 
     def pause(self) -> None:
         """Start no more executions; running ones finish.  No thread waits in the epoll then."""
         with self.lock:
             self.start_no_more()
             self._let_go_on()
-            self.muting.end()
             self.due.arm(0)
             if not self.polling or self._leaving:
                 return
@@ -422,7 +449,7 @@ class WorkerPool:
                     if work.entity.exclusive is not None:
                         work.entity.exclusive.ending_execution(work.entity.rclpy)
             self._closed = True
-            self._release_parked()
+            self.parking.end()
             threads = list(self._threads)
         deadline = None if timeout is None else monotonic_ns() + int(timeout * 1e9)
         done = True
@@ -439,7 +466,7 @@ class WorkerPool:
         self.start_no_more()
         self._at_end = then
         self._closed = True
-        self._release_parked()
+        self.parking.end()
         if not self._threads:
             self._all_have_ended()
 
@@ -451,11 +478,6 @@ class WorkerPool:
         with self.lock:
             then, self._at_end = self._at_end, _nothing
         then()
-
-    def _release_parked(self) -> None:
-        with suppress(IndexError):  # without the lock another thread may take the last one
-            while True:
-                self._parked.pop().permit.release()
 
     @staticmethod
     def _join(each: WorkerThread, deadline: int | None) -> bool:
@@ -476,17 +498,18 @@ class WorkerPool:
 
     def _new_thread(self) -> WorkerThread:
         me = WorkerThread(self, None)
+        me.state = ThreadState.PARKED
         me.worker = len(self._threads) % self.engine.n_workers
         me.thread = threading.Thread(
             target=self._run, args=(me,), daemon=True, name=f'mddag-worker-{len(self._threads)}')
         self._threads.append(me)
-        self._parked.append(me)
+        self._n_parked += 1
         try:
             me.thread.start()
         except BaseException:  # too many threads, or an interrupt
             if me.thread.ident is None:
                 self._threads.remove(me)
-                self._parked.remove(me)
+                self._n_parked -= 1
             raise
         return me
 
@@ -504,76 +527,100 @@ class WorkerPool:
         finally:
             with self.lock:
                 self._threads.remove(me)
-                if me in self._parked:
-                    self._parked.remove(me)
-                if me.waits_since:  # it has failed
-                    me.waits_since = 0
-                    self.polling -= 1
+                if me.state is ThreadState.WAITING:  # it has failed
+                    self._become(me, ThreadState.PARKED)
+                self._n_parked -= me.state is ThreadState.PARKED
                 is_last = self._closed and not self._threads
             if is_last:
                 self._all_have_ended()
 
     def _work(self, me: WorkerThread) -> None:
         """Take turns until the pool is closed."""
-        loop, receive, go_on, execute = self.loop, self._receive, self._go_on, self._execute
-        me.permit.acquire()
-        if self._closed:
-            return
-        me.is_parked = False
+        wait, park, receive, go_on, execute = (
+            self.loop.wait, self.parking.wait, self._receive, self._go_on, self._execute)
         current.running = me
-        found = go_on(me)
+        found = False
         while True:
             if found:
                 execute(me)
-                if not self.polling and self.now - self._polled_at > SHORT_CALLBACK_NS:
-                    self._polled_at = self.now
-                    events = loop.wait(0)
-                    if events:
-                        receive(me, events)
                 found = go_on(me)
-            elif me.is_parked:
-                me.permit.acquire()
+            elif me.state is ThreadState.PARKED:
+                park()
                 if self._closed:
                     return
-                me.is_parked = False
-                found = go_on(me)
+                found = receive(me, None)
             else:
-                found = receive(me, loop.wait())
+                found = receive(me, wait())
+
+    def _become(self, me: WorkerThread, state: ThreadState) -> None:
+        """Change the state of a thread; the caller holds the lock."""
+        before = me.state
+        if before is state:
+            return
+        if state not in _NEXT[before]:
+            raise InvariantError([f'a thread that was {before.value} is {state.value}'])
+        me.state = state
+        if me.thread is not None:
+            self._n_parked += (state is ThreadState.PARKED) - (before is ThreadState.PARKED)
+        if state is ThreadState.WAITING:
+            self.polling += 1
+            me.waits_since = self.now
+        elif before is ThreadState.WAITING:
+            self.polling -= 1
+            if self._leaving and not self.polling:
+                self._all_left.set()
 
     # --- a turn ----------------------------------------------------------------------------------
 
-    def _receive(self, me: WorkerThread, events: Events) -> bool:
-        """Handle events, and find the thread's next execution if it has none; see ``_go_on``."""
+    def _receive(self, me: WorkerThread, events: Events | None) -> bool:
+        """
+        Handle events, and find the thread's next execution if it has none; see ``_go_on``.
+
+        :param events: None: a parked thread looks for them.
+        """
         with self.lock:
             # inlined tick: saves a call for each execution
             now = self.now = monotonic_ns() + self._offset
-            since = me.waits_since
-            if since:
-                me.waits_since = 0
+            since = now
+            if me.state is ThreadState.WAITING:
+                since = me.waits_since
                 self._polled_at = now
-                self.polling -= 1
-                if self._leaving and not self.polling:
-                    self._all_left.set()
-            self._bell_rings = False  # the waiting thread may have received it
-            for source in self.loop.sources(events):
-                if self.running:
-                    source.collect()
-                else:
-                    self.loop.announce(source)  # for the next spin
-            now = self.now      # a recorded message is later than the turn began
-            timers = self.timers
-            if (timers.has_new or timers.has_jumped
-                    or self.loop.timer.at <= now - self._offset):
-                if self.running:
-                    self.due.handle(now, since or now)
-                self.due.arm(now - self._offset)
+            if events is None:
+                self._has_called = False
+                self.due.has_looked(now - self._offset)
+                self._look(now)
+            else:
+                self._bell_rings = False  # the waiting thread may have received it
+                self._collect(events, since)
             is_ready = me.work is None and not self.deferred
-            found = is_ready and self._choose(me, now, True)
+            found = is_ready and self._choose(me, self.now)
         if self.deferred:
             self._do_deferred()
         if not is_ready:
             found = me.work is None and self._go_on(me)
         return found
+
+    def _collect(self, events: Events, since: int) -> None:
+        """
+        Collect the arrivals of events, and handle what is due; the caller holds the lock.
+
+        :param since: since when the calling thread has waited for them.
+        """
+        for source in self.loop.sources(events):
+            if self.running:
+                source.collect()
+            else:
+                self.loop.announce(source)  # for the next spin
+        now = self.now - self._offset      # a recorded message is later than the turn began
+        if self.running and (self.timers.has_new or self.loop.timer.at <= now
+                             or self.due.is_due(now)):
+            self.due.handle(self.now, since)
+
+    def _look(self, now: int) -> None:
+        """Collect what has come while no thread waited for it; the caller holds the lock."""
+        if self.running and not self.polling:
+            self._polled_at = now
+            self._collect(self.loop.poll(), now)
 
     def _go_on(self, me: WorkerThread, is_last: bool = False) -> bool:
         """
@@ -595,15 +642,16 @@ class WorkerPool:
                         engine.ask_again()
                 else:
                     self._report_unusual_end(me, work, now)
+                if self._pauses:
+                    self.end_pauses()
                 if work.entity.removed:
                     self.wake_executor()  # the registry can forget it now
-                if self.muting.until and not engine.holders:
-                    self.muting.end()
-                    self.due.arm(now - self._offset)  # muted timers have new due times
+                if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:
+                    self._look(now)
             if is_last:
                 self.due.arm(now - self._offset)
                 self.log_misses()
-            found = not is_last and self._choose(me, now, False)
+            found = not is_last and self._choose(me, self.now)
         if self.deferred:
             self._do_deferred()
         return found
@@ -619,7 +667,8 @@ class WorkerPool:
 
         :param mine: since when the calling one has, or now.
         """
-        return min([mine, *(each.waits_since for each in self._threads if each.waits_since)])
+        return min([mine, *(
+            each.waits_since for each in self._threads if each.state is ThreadState.WAITING)])
 
     def _do_deferred(self) -> None:
         """Call the functions that waited for the lock; exceptions do not end the thread."""
@@ -633,71 +682,70 @@ class WorkerPool:
             except BaseException as error:
                 self.fail(error)
 
-    def _choose(self, me: WorkerThread, now: int, has_events: bool) -> bool:
+    def _choose(self, me: WorkerThread, now: int) -> bool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         engine = self.engine
         due = self.due
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
-        may_run = self.running and not (self._is_stepping and me.thread is not None)
+        may_run = self.running and not (self.is_stepping and me.thread is not None)
         work: Any = engine.dispatch(me.worker, now) if may_run else None
         while work in self._rejoining:
             self._hand_over(work, now)
             work = engine.dispatch(me.worker, now)
-        if (engine.deadlines.next < due.deadline
-                or work is None and (due.may_expire_early or engine.holders)):
-            due.arm(now - self._offset)
         if work is None:
             self.log_misses()
             if me.thread is not None:  # else a visitor: the thread of a spin_once
-                self._rest(me, has_events)
-                if self._is_stepping and engine.may_start_more(now):
-                    self._wake_one()
+                self._rest(me)
+                if self.is_stepping and engine.may_start_more(now):
+                    self._call()
+            due.arm(now - self._offset)
             return False
         me.work = work
         me.worker = work.worker
-        entity = work.entity
-        is_short = entity.wall_ns <= SHORT_CALLBACK_NS
-        holds = bool(engine.holders) and engine.holders[-1] is work
-        if holds:
-            if entity.habit.mean_ns >= TURN_NS or self.muting.until and not is_short:
-                self.muting.update(now)
-                due.arm(now - self._offset)  # timers that are muted no more may be due sooner
-            if engine.has_waiting and not (is_short and due.is_checking):
-                due.check_holder(now - self._offset)
-        if is_short:
-            self._leader = me
-            if self.guard.at == NEVER:
-                if not self.polling:
-                    self._admit()
-                elif not holds and engine.has_waiting:
-                    self._guard(now - self._offset)
-        elif not self.polling:
-            self._admit()
-        elif engine.may_start_more(now):
-            self._wake_one()
+        self._become(me, ThreadState.RUNNING)
+        is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
+        computes = bool(engine.holders) and engine.holders[-1] is work
+        if computes and len(engine.holders) > 1 and engine.pauses:
+            self._pause(engine.holders[-2], me)
+        me.is_spare = not (is_short or computes)
+        if self.is_stepping:
+            due.arm(now - self._offset)
+        elif self.polling:
+            if engine.may_start_more(now):
+                self._call()
+            elif (self.timers.has_new or self.loop.timer.at == NEVER
+                    or engine.deadlines.next < due.deadline):
+                due.arm(now - self._offset)
+        elif engine.idle_workers:
+            if me.is_spare or self._eager and not is_short or engine.may_start_more(now):
+                self._call()
+            elif is_short:
+                due.look_after(now - self._offset)
+            else:
+                due.look(now - self._offset)
         return True
 
-    def _rest(self, me: WorkerThread, has_events: bool) -> None:
-        """
-        Let a thread without an execution wait in the epoll, or park it.
+    def _pause(self, overtaken: Work, me: WorkerThread) -> None:
+        """Let a callback pause for that of the calling thread; the caller holds the lock."""
+        thread = self.thread_of(overtaken)
+        if thread is not None and overtaken not in self._pauses:
+            me.pause = self._pauses[overtaken] = Pause(thread.ident, me.ident)
 
-        :param has_events: whether it has just collected arrivals.
-        """
-        leader = self._leader
-        is_left_to_leader = (
-            has_events and leader is not me and leader is not None and leader.is_short())
-        if self.running and not self._is_stepping and not is_left_to_leader and (
-                len(self._threads) - self._waiting_calls - len(self._parked)
-                <= self.engine.n_workers):
-            me.waits_since = self.now
-            self.polling += 1
-            return
-        me.is_parked = True
-        if is_left_to_leader and self.running and not self.polling:
-            self._guard(self.now - self._offset)
-        self._parked.append(me)
-        if self._closed:  # it ends; checked last, as ``leave`` does not take the lock
-            self._release_parked()
+    def end_pauses(self) -> None:
+        """Let those go on that are overtaken no more; the caller holds the lock."""
+        overtaken = self.engine.holders[:-1]
+        for work in [each for each in self._pauses if each not in overtaken]:
+            self._pauses.pop(work).end()
+
+    def _rest(self, me: WorkerThread) -> None:
+        """Let a thread without an execution wait for events, or park it."""
+        engine = self.engine
+        others = self.polling - (me.state is ThreadState.WAITING)
+        # while a callback computes, its thread handles the events when it ends
+        waits = self.running and not self.is_stepping and not self._closed and (
+            self._eager > 0 or not engine.holders) and (
+            others == 0 or me.is_spare and others < engine.idle_workers)
+        self._become(me, ThreadState.WAITING if waits else ThreadState.PARKED)
 
     def thread_of(self, work: Work) -> WorkerThread | None:
         """Return the thread that runs an execution."""
@@ -718,6 +766,9 @@ class WorkerPool:
             measurement = Measurement(habit)
         me.measurement = measurement
         me.published = 0
+        if me.pause is not None:
+            pause, me.pause = me.pause, None
+            pause.wait_for_it()
         start = monotonic_ns()
         try:
             if group is not None and work.coroutine is None and (
@@ -753,13 +804,10 @@ class WorkerPool:
             habit.rests -= 1
         else:
             work.cpu_ns += measurement.end()
-            if entity.is_nested != habit.computes and entity.classify is not None:
-                with self.lock:
-                    if entity.classify is not None:  # it may have been removed meanwhile
-                        entity.classify()
         if wall > SHORT_CALLBACK_NS:
             habit.rests = 0  # long callbacks are measured each time
         entity.wall_ns += (wall - entity.wall_ns) >> 3 if entity.ran else wall - entity.wall_ns
+        self.note_eager(entity)
         if me.published:
             tail = me.end - self._offset - me.published
             entity.tail_ns += (tail - entity.tail_ns) >> 3
@@ -805,7 +853,7 @@ class WorkerPool:
         """Resume a suspended execution when the future that it waits for is done."""
         resume = partial(self.resume, work)
         if awaited is NEXT_TURN or not hasattr(awaited, 'add_done_callback'):
-            if self._is_stepping:
+            if self.is_stepping:
                 self._of_next_step.append(work)
                 return
             work.yields += 1
@@ -829,14 +877,16 @@ class WorkerPool:
                 self._waiting_calls += 1
                 self.lent += 1
                 self.tick()
+                self._become(me, ThreadState.OUT)
                 self.engine.lend(me.work)
+                self.end_pauses()
                 free = len(self._threads) - self._waiting_calls
                 if me.thread is not None and self.running and free < self.engine.n_workers:
                     self._new_thread()
                 if self.polling:
                     self.wake_for_more()
                 else:
-                    self._admit()
+                    self._call()
         measurement = me.measurement if lends else None
         if measurement is not None:
             measurement.pause()
@@ -868,9 +918,9 @@ class WorkerPool:
             if first is not None:
                 self._hand_over(first, now)
             if not self.polling:
-                self._admit()
+                self._call()
             elif engine.may_start_more(now):
-                self._wake_one()
+                self._call()
             elif engine.holders and engine.idle_workers:
                 self.due.check_holder(now - self._offset)
             seen = self._n_ended, process_time_ns()
@@ -884,6 +934,7 @@ class WorkerPool:
     def _hand_over(self, work: Work, now: int) -> None:
         """Let an execution go on that was dispatched again; the caller holds the lock."""
         thread = self._rejoining.pop(work)
+        self._become(thread, ThreadState.RUNNING)
         thread.worker = work.worker
         thread.is_out = False
         self._waiting_calls -= 1
@@ -894,7 +945,9 @@ class WorkerPool:
     def _go_on_without(self, work: Work) -> None:
         """Let an execution go on without a worker; the caller holds the lock."""
         self.engine.go_on_without(work)
-        self._rejoining.pop(work).permit.release()
+        thread = self._rejoining.pop(work)
+        self._become(thread, ThreadState.RUNNING)
+        thread.permit.release()
 
     def _let_go_on(self) -> None:
         """Let all executions go on that wait for their workers; the caller holds the lock."""
@@ -911,14 +964,13 @@ class WorkerPool:
             yield
         finally:
             with self.lock:
-                self.running = self._is_stepping = False
+                self.running = self.is_stepping = False
                 self._let_go_on()
-                self.muting.end()
 
     def resume_stepping(self) -> None:
         """Continue as in ``stepping``, after ``start`` and ``pause``."""
         with self.lock:
-            self.running = self._is_stepping = True
+            self.running = self.is_stepping = True
             self.stopped_at = 0
             self.due.begin(self.tick() - self._offset)
 

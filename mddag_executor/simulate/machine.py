@@ -135,12 +135,12 @@ def decide(t: Tables, s: State, m: Machine, now: int) -> None:
                 last = x
         first = first_waiting(t, s, process) if last >= 0 else -1
         if first >= 0 and s.x_holds[first] == process:
+            preempts = s.scalars[PREEMPTIVE] != 0
             s.overtaking[process] = int(overtaking_pays(
-                t, s, process, now - s.x_started[last], s.x_cost[last],
-                s.scalars[PREEMPTIVE] != 0))
+                t, s, process, now - s.x_started[last], s.x_cost[last], preempts))
             if s.overtaking[process] == 0:
                 pays_at = s.x_started[last] + overtaking_pays_from(
-                    t, s, process, s.x_cost[last])
+                    t, s, process, s.x_cost[last], preempts)
                 if now < pays_at < m.scalars[OVERTAKE_AT]:
                     m.scalars[OVERTAKE_AT] = pays_at
 

@@ -508,7 +508,6 @@ class Twin:
         return (
             started and (started.args, started.worker), engine.queue_length, engine.has_waiting,
             engine.idle_workers, engine.may_start_more(now),
-            engine.waits_since(now),
             [(len(each.waiting), each.ran, each.dropped, each.skipped, each.failed)
              for each in self.entities])
 

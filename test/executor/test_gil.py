@@ -11,6 +11,7 @@ import time
 
 from mddag_executor.executor import publishing
 from mddag_executor.executor.compat import function_of_task
+from mddag_executor.executor.pausing import can_pause
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionServer
@@ -110,14 +111,18 @@ class Computing:
 
     :ivar ran: what has happened, in order.
     :ivar meanwhile: called, while the long one computes, until it returns true.
+    :ivar urgent: called by the urgent one.
+    :ivar takes: for how many ms the long one computes before that.
     """
 
     def __init__(self, make_executor, make_node):
         self.ran = []
         self.begun = threading.Event()
         self.meanwhile = lambda: True
+        self.urgent = lambda: None
+        self.takes = 60
         nodes = Declared(make_node, COMPUTING, {
-            'long': self._long, 'urgent': lambda: self.ran.append('urgent'),
+            'long': self._long, 'urgent': lambda: (self.urgent(), self.ran.append('urgent')),
             'patient': lambda: self.ran.append('patient')})
         # messages for callbacks with longer deadlines may stay in the middleware
         self.executor = make_executor(
@@ -139,7 +144,7 @@ class Computing:
     def _long(self):
         self.ran.append('begins')
         self.begun.set()
-        compute(60)
+        compute(self.takes)
         end = time.monotonic() + 15.0
         while not self.meanwhile() and time.monotonic() < end:
             compute(1)
@@ -188,13 +193,56 @@ def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing):
 
 
 @pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
-def test_what_cannot_start_is_left_in_the_middleware(computing):
-    """While the long one computes for as long as usual, no thread wakes for the patient one."""
-    queued = []
-    computing.meanwhile = lambda: queued.append(computing.executor.statistics()['queue']) or True
-    computing.habit.mean_ns = 20_000 * MS
+def test_no_thread_waits_for_events_while_a_callback_computes(computing):
+    waiting = []
+    computing.meanwhile = lambda: waiting.append(computing.executor._pool.polling) or (
+        len(waiting) > 20)
     assert computing.order('patient') == ['begins', 'ends', 'patient']
-    assert queued == [0]
+    assert not any(waiting)
+
+
+@pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
+def test_a_callback_pauses_while_a_more_urgent_one_computes(computing):
+    steps, still = [0], []
+
+    def step():
+        steps[0] += 1
+        return 'urgent' in computing.ran
+
+    def urgent():
+        """Compute until the other one has made no step for 20 ms; it has if they share."""
+        end = time.monotonic() + 15.0
+        while not still and time.monotonic() < end:
+            before = steps[0]
+            compute(20)
+            if steps[0] == before:
+                still.append(before)
+
+    computing.meanwhile, computing.urgent, computing.takes = step, urgent, 0
+    assert computing.order('urgent') == ['begins', 'urgent', 'ends']
+    assert still and steps[0] > still[0]  # it went on then
+
+
+@pytest.mark.parametrize('is_held_by', ['user', 'library'])
+def test_a_callback_that_owns_a_lock_does_not_pause_for_ever(computing, is_held_by):
+    lock = threading.Lock()
+
+    def meanwhile():
+        with lock:
+            if is_held_by == 'user':
+                compute(1)
+            else:
+                sorted(range(100), key=lambda _: compute(0.01) or 0)
+        return 'urgent' in computing.ran
+
+    def urgent():
+        for _ in range(20):
+            with lock:
+                compute(0.1)
+
+    computing.meanwhile, computing.urgent, computing.takes = meanwhile, urgent, 0
+    for _ in range(3):
+        assert computing.order('urgent') == ['begins', 'urgent', 'ends']
 
 
 # --- callbacks that lend their workers, and go on ------------------------------------------------

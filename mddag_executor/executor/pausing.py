@@ -1,0 +1,162 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Callbacks that compute in Python pause for more urgent ones.
+
+Theory of operation
+-------------------
+A callback that is overtaken (rule 11 of ``core.rules``) would share the GIL with the more urgent
+one: each time that one gives it away, for example in numpy, the overtaken one keeps it for a
+switch interval.  Instead it pauses at the next line or jump of its own code: ``sys.monitoring``
+(Python 3.12) calls a function there, which waits for a lock.  With an older Python, and if other
+tools use all of its identifiers, the two share the GIL.
+
+1.  Only code that the overtaken thread executes at that moment is instrumented, and only until it
+    pauses.  The thread of the urgent callback waits for that, but at most ``PAUSES_BY_S``.  A
+    thread that is in C code meanwhile pauses when that returns.
+2.  It pauses in code of the user's own only: never in this package, in rclpy or in Python's
+    library, which may own locks that others need at once.
+3.  A callback may pause while it owns a lock that the urgent one needs.  So the paused thread
+    checks every ``CHECK_S`` whether the urgent one computes; if not, it goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+import sys
+import sysconfig
+import threading
+from time import monotonic_ns
+from types import CodeType, FrameType
+from typing import Any
+
+import mddag_executor
+from mddag_executor.executor.gil import cpu_ns
+import rclpy
+
+PAUSES_BY_S = 0.001
+CHECK_S = 0.002
+
+_monitoring: Any = getattr(sys, 'monitoring', None)
+_LIBRARY = sysconfig.get_path('stdlib')
+_FOREIGN = ('site-packages', 'dist-packages')
+_KEPT_OUT = tuple(os.path.dirname(module.__file__ or '') for module in (mddag_executor, rclpy))
+
+
+class Pause:
+    """
+    One pause of a thread; all methods but ``wait_for_it`` and ``take`` need the engine's lock.
+
+    :param ident: of the thread; ``urgent``: of the thread of the callback that overtakes it.
+    """
+
+    __slots__ = ('ident', '_urgent', '_may_go_on', '_has_begun', '_codes', '_is_taken')
+
+    def __init__(self, ident: int, urgent: int) -> None:
+        self.ident = ident
+        self._urgent = urgent
+        self._may_go_on = threading.Lock()
+        self._may_go_on.acquire()
+        self._has_begun = threading.Lock()
+        self._has_begun.acquire()
+        self._is_taken = False
+        self._codes = [*_own_code(sys._current_frames().get(ident))]
+        if self._codes:
+            _monitor.begin(self, self._codes)
+
+    def wait_for_it(self) -> None:
+        """Wait in the thread of the urgent callback until the other one has paused."""
+        if self._codes:
+            self._has_begun.acquire(timeout=PAUSES_BY_S)
+
+    def take(self) -> None:
+        """Pause; called by the thread itself."""
+        if self._is_taken:
+            return
+        self._is_taken = True
+        _monitor.end(self, self._codes)
+        self._has_begun.release()
+        at, own = monotonic_ns(), cpu_ns(self._urgent)
+        while not self._may_go_on.acquire(timeout=CHECK_S):
+            before, at, own_before = at, monotonic_ns(), own
+            own = cpu_ns(self._urgent)
+            if 20 * (own - own_before) < at - before:
+                return  # it may wait for a lock of this one
+
+    def end(self) -> None:
+        """Let the thread go on."""
+        _monitor.end(self, self._codes)
+        self._may_go_on.release()
+
+
+VARIABLE = 'MDDAG_PAUSE'
+"""Callbacks share the GIL instead if this variable of the environment is 0."""
+
+
+class _Monitor:
+    """This process's use of ``sys.monitoring``, for all executors."""
+
+    def __init__(self) -> None:
+        self._pauses: dict[int, Pause] = {}
+        self._users: dict[CodeType, int] = {}
+        self._lock = threading.RLock()
+        self._tool = -1
+
+    def is_available(self) -> bool:
+        """Return whether callbacks can pause."""
+        if _monitoring is None or os.environ.get(VARIABLE) == '0':
+            return False
+        with self._lock:
+            if self._tool < 0:
+                self._tool = next((i for i in (4, 3) if _monitoring.get_tool(i) is None), -1)
+                if self._tool < 0:
+                    return False
+                _monitoring.use_tool_id(self._tool, 'mddag_executor')
+                for event in (_monitoring.events.LINE, _monitoring.events.JUMP):
+                    _monitoring.register_callback(self._tool, event, self._at_event)
+        return True
+
+    def _at_event(self, *_: Any) -> None:
+        pause = self._pauses.get(threading.get_ident())
+        if pause is not None:
+            pause.take()
+
+    def begin(self, pause: Pause, codes: list[CodeType]) -> None:
+        """Let a thread pause in some code."""
+        events = _monitoring.events.LINE | _monitoring.events.JUMP
+        with self._lock:
+            self._pauses[pause.ident] = pause
+            for code in codes:
+                users = self._users[code] = self._users.get(code, 0) + 1
+                if users == 1:
+                    _monitoring.set_local_events(self._tool, code, events)
+
+    def end(self, pause: Pause, codes: list[CodeType]) -> None:
+        """End ``begin``; further calls do nothing."""
+        with self._lock:
+            if self._pauses.get(pause.ident) is not pause:
+                return
+            del self._pauses[pause.ident]
+            for code in codes:
+                self._users[code] -= 1
+                if not self._users[code]:
+                    del self._users[code]
+                    _monitoring.set_local_events(self._tool, code, 0)
+
+
+_monitor = _Monitor()
+can_pause = _monitor.is_available
+
+
+def _own_code(frame: FrameType | None) -> Iterator[CodeType]:
+    """Yield the code of a callback, and of what it has called, that it may pause in."""
+    seen = set()
+    while frame is not None and frame.f_globals.get('__name__') != 'mddag_executor.executor.work':
+        code = frame.f_code
+        path = code.co_filename
+        in_library = path.startswith(_LIBRARY) and not any(name in path for name in _FOREIGN)
+        if code not in seen and not in_library and not path.startswith((*_KEPT_OUT, '<frozen')):
+            seen.add(code)
+            yield code
+        frame = frame.f_back
