@@ -165,9 +165,6 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('core_bypassed_while_it_has_others', [(
         'executor/engine.py', 'self._may_bypass and self._is_core_empty()', 'self._may_bypass')],
         of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
-    Case('tasks_go_on_by_themselves_as_well', [(
-        'executor/', 'def _add_resume_callback(', 'def _not_called(')], of(
-        'test_tasks.py', 'test_a_task_awaits_one_future_after_another[newer]')),
     Case('exceptions_swallowed', [(
         'executor/executor.py', 'self._errors.append(error)', 'pass')], of(
         'test_spin.py', *(
