@@ -22,10 +22,12 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag diff before.mcap after.mcap
-mddag diff before.mcap after.mcap graph.yaml --fail-on-worse --tolerance 10% --json diff.json
+mddag diff before.mcap after.mcap graph.yaml --fail-on-worse --allow-growth 10% --json diff.json
 mddag diff before/ after/
 
 exit status: 0 compared; 1 with --fail-on-worse when a sink got worse; 2 bad input"""
+
+REMOVED_OPTIONS = {'--skip': 'it is --from now', '--tolerance': 'it is --allow-growth now'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,11 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--callbacks', action='store_true', help='also show a table of all callbacks')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
-        'p99 response time grew by more than the tolerance')
-    add('--tolerance', type=_share, metavar='SHARE',
+        'p99 response time grew by more than is allowed')
+    add('--allow-growth', type=_share, metavar='SHARE',
         help='with --fail-on-worse and in the tables: how much the p99 response time of a sink '
         'may grow, as 10%% (default: by any amount)')
-    options.add(parser, '--skip', '--json')
+    options.add(parser, '--from', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -55,7 +57,7 @@ def main(args: argparse.Namespace) -> int:
         Source(*common.input_path(common.one_run([path], ())), task_set)
         for path in (args.first, args.second))
     before, after = _results(args, first, second)
-    difference = diff.compare(before, after, args.tolerance)
+    difference = diff.compare(before, after, args.allow_growth)
     common.show(args, difference, diff.lines(difference, args.callbacks))
     if not args.fail_on_worse:
         return 0
@@ -70,16 +72,16 @@ def _results(
     args: argparse.Namespace, first: Source, second: Source
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     if _has_declaration(first):
-        before, declared = _result(first, args.skip)
+        before, declared = _result(first, args.begin or 0)
         if not _has_declaration(second):
             second = second._replace(task_set=declared)
-        return before, _result(second, args.skip)[0]
+        return before, _result(second, args.begin or 0)[0]
     # without one of its own it is judged by the other's, and that must have one
     if not _has_declaration(second):
         first.check_deadlines()
         second.check_deadlines()
-    after, declared = _result(second, args.skip)
-    return _result(first._replace(task_set=declared), args.skip)[0], after
+    after, declared = _result(second, args.begin or 0)
+    return _result(first._replace(task_set=declared), args.begin or 0)[0], after
 
 
 def _has_declaration(source: Source) -> bool:

@@ -31,12 +31,15 @@ if TYPE_CHECKING:
 
 EXAMPLE = """\
 mddag evaluate config/autoware.yaml --runs 5000 --plot acceptance.png
-mddag evaluate graph.yaml --policies rad,gedf --workers 4 --samples measured.npz --json out.json
-mddag evaluate graph.yaml --no-preemptive --overhead 50us
+mddag evaluate graph.yaml --policies rad,gedf --workers 4 --execution-times measured.npz
+mddag evaluate graph.yaml --no-preemptive --overheads 50us
 mddag evaluate graph.yaml --runs 100000 --first-run 100000 --dask tcp://head:8786 --json part2.json
 mddag generate --sets 400 --utilisation 0.1:1.0 -o sets && mddag evaluate sets --plot sets.svg"""
 
 _RUNS, _RUNS_OF_EACH = 5000, 1
+REMOVED_OPTIONS = {
+    '--jobs': 'it is --parallel now', '--overhead': 'it is --overheads now',
+    '--samples': 'it is --execution-times now'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'adding their counts (default: 0)')
     add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',
         help=f'any of {", ".join(POLICIES)} (default: %(default)s)')
-    add('--samples', metavar='FILE.npz', type=options.Input,
+    add('--execution-times', metavar='FILE.npz', type=options.Input,
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')
     options.add(parser, '--preemptive', otherwise='as in the paper: '
@@ -64,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scheduler, as tcp://host:8786 (extra 'dask')")
     add('--plot', metavar='OUT', type=options.NamedFile,
         help="draw the paper's figure (.png, .svg or .pdf)")
-    options.add(parser, '--workers', '--seed', '--duration', '--overhead', '--jobs', '--json')
+    options.add(parser, '--workers', '--seed', '--duration', '--overheads', '--parallel', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -113,19 +116,19 @@ def _evaluate(
     from mddag_executor.laboratory.experiment import Experiment
     if args.dask is not None and find_spec('distributed') is None:
         raise UsageError("--dask: Dask is not installed: install 'mddag_executor[dask]' with pip")
-    samples = _samples(args.samples, task_sets)
+    samples = _samples(args.execution_times, task_sets)
     experiments = [
         Experiment(
             task_set, policies, workers=defaults.workers(args.workers, task_set),
             duration_ns=args.duration, seed=args.seed, samples=its_samples,
-            preemptive=args.preemptive, overhead_ns=args.overhead,
+            preemptive=args.preemptive, overhead_ns=args.overheads,
             judge=args.judge)
         for task_set, its_samples in zip(task_sets, samples)]
     runs = args.runs or (_RUNS if len(task_sets) == 1 else _RUNS_OF_EACH)
     with Progress('evaluating', runs * len(task_sets)) as line:
         return evaluate(
-            experiments, runs, first_run=args.first_run, jobs=args.jobs or defaults.processors(),
-            dask=args.dask, progress=lambda done: line.update(
+            experiments, runs, first_run=args.first_run, dask=args.dask,
+            jobs=args.parallel or defaults.processors(), progress=lambda done: line.update(
                 done, f'of {runs * len(task_sets)} runs'))
 
 

@@ -12,7 +12,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.cli import common, options, recorded
+from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import printable, warn
 from mddag_executor.errors import UsageError
 
@@ -27,6 +27,8 @@ mddag explain run.mcap graph.yaml --json -"""
 
 MOST_SHOWN = 20
 
+REMOVED_OPTIONS = {'--skip': 'it is --from now'}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
@@ -35,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='only jobs of this sink: /node:callback, or the end of its name, as tables show it')
     add('--job', type=options.not_negative_int, metavar='K',
         help='only the job of this number')
-    options.add(parser, '--from', '--to', '--skip', '--json')
+    options.add(parser, '--from', '--to', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -43,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     source = recorded.source_of(args)
     if source.task_set is None:
         source.check_deadlines()
-    outcome = recorded.as_recorded(source, 'explaining', args.skip, args.begin, args.end)
+    outcome = recorded.as_recorded(source, 'explaining', begin=args.begin, end=args.end)
     sink = None if args.sink is None else _sink(args.sink, outcome.task_set)
     if args.job is not None:
         _check_job(args.job, outcome, sink)
@@ -52,6 +54,7 @@ def main(args: argparse.Namespace) -> int:
     every = sink is None and args.job is None
     common.show(args, result, (
         _lines(outcome) if every else _job_lines(result['jobs'])))
+    verdicts.check_judged(outcome.result()['dags'], str(args.trace))
     return 0
 
 

@@ -11,7 +11,7 @@ from mddag_executor.cli.text import warn
 
 EXAMPLE = """\
 mddag graph from-caret architecture.yaml -o graph.yaml
-mddag graph from-caret architecture.yaml --trace ~/.ros/tracing/session-20261121 -o graph.yaml
+mddag graph from-caret architecture.yaml ~/.ros/tracing/session-20261121 -o graph.yaml
 mddag graph check graph.yaml
 """
 DESCRIPTION = """\
@@ -19,15 +19,17 @@ Make a declaration from a CARET architecture file: nodes, callbacks, timers, top
 groups, variable passings, message contexts and named paths. Facts that such a file lacks
 (deadlines, rates from outside, which callback publishes) are in comments marked 'FILL IN', with a
 proposal; remove the first '# ' of such a line once its value is right. With a recording of
-the same system (--trace) the rates of sources are proposed from it, the quantiles of the measured
+the same system (TRACE) the rates of sources are proposed from it, the quantiles of the measured
 execution times (0, 50, 90, 99, 100 %) are filled in, and the recorded publishers of a topic
 are filled in."""
+
+REMOVED_OPTIONS = {'--trace': 'name the recording after ARCHITECTURE.yaml'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('architecture', metavar='ARCHITECTURE.yaml', type=options.Input,
                         help="the architecture file ('-': standard input)")
-    parser.add_argument('--trace', metavar='TRACE', type=options.Input,
+    parser.add_argument('trace', metavar='TRACE', type=options.Input, nargs='?',
                         help='measure rates and execution times in this recording: a trace '
                         "(MCAP; '-': standard input), or the folder of a session that LTTng "
                         'recorded (needs python3-bt2)')

@@ -14,7 +14,7 @@ from mddag_executor.cli.text import Cell, one_line, table
 from msg_graph import TaskSet
 
 EXAMPLE = """\
-mddag graph place graph.yaml --processes 3 --trace run.mcap -o placed.yaml
+mddag graph place graph.yaml run.mcap --processes 3 -o placed.yaml
 mddag replay run.mcap --reschedule --processes placed.yaml
 mddag run placed.yaml --node my_robot/lidar --node my_robot/camera --node my_robot/control"""
 DESCRIPTION = """\
@@ -30,7 +30,8 @@ REMOVED_OPTIONS = {
                     "'mddag replay RUN.mcap --reschedule --processes PLACED.yaml' has it, and "
                     'checks the placement'),
     **dict.fromkeys(('--execution-times', '--utilisation', '--seed'),
-                    "declare execution times, or give '--trace'")}
+                    'declare execution times, or name a recording after GRAPH'),
+    '--trace': 'name the recording after GRAPH'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,10 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how many processes')
     add('-o', '--output', metavar='PLACED.yaml', type=options.Output, required=True,
         help="the declaration to write ('-': to standard output)")
-    add('--trace', metavar='TRACE', type=options.Input, action='append', default=[],
-        help='use the execution times of a recorded run, and which callbacks compute in Python '
-        'there (default: as declared); repeat it for the traces of several processes')
     options.add(parser, 'graph', '--json')
+    add('trace', metavar='TRACE', type=options.Input, nargs='*',
+        help='use the execution times of this recorded run, and which callbacks compute in Python '
+        'there (default: as declared); for a run of several processes the traces of all')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -193,19 +193,15 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'type': duration, 'default': defaults.DURATION_NS, 'metavar': 'TIME',
         'help': 'virtual time of each run',
         'otherwise': f'{defaults.DURATION_NS // 10 ** 9}s'},
-    '--overhead': {
+    '--overheads': {
         'type': duration_or_zero, 'default': 0, 'metavar': 'TIME',
         'help': 'time that each dispatch of a callback costs in addition', 'otherwise': '0'},
-    '--jobs': {
+    '--parallel': {
         'type': positive_int, 'metavar': 'N', 'help': 'how many runs to simulate at a time',
         'otherwise': 'the number of processors'},
     '--utilisation': {
         'type': utilisation, 'metavar': 'U',
         'help': 'scale the execution times to this normalised utilisation, sum(C/T)/workers'},
-    '--skip': {
-        'type': duration_or_zero, 'default': 0, 'metavar': 'TIME',
-        'help': 'leave out a warm-up: jobs released less than this after the first one, for '
-        'instance 1s, are not judged', 'otherwise': 'all jobs are judged'},
     '--from': {
         'type': duration_or_zero, 'metavar': 'TIME', 'dest': 'begin',
         'help': 'only jobs that were released from this time on, counted from the first release, '

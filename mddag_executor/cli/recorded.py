@@ -60,10 +60,10 @@ def check(args: argparse.Namespace) -> None:
     """Check the options that depend on each other."""
     if args.processes == '0':
         raise UsageError('--processes 0: give 1 or more, or a file')
-    if span_of(args.begin, args.end, args.skip) is not None and args.reschedule:
-        raise UsageError('--reschedule: the scheduler runs over whole recordings: leave it out, '
-                         'or --from and --to')
     if args.reschedule:
+        if args.end is not None:
+            raise UsageError('--to: the scheduler runs to the end of a recording: leave it or '
+                             '--reschedule out')
         if args.callbacks:
             raise UsageError(
                 '--callbacks: it shows what was recorded: leave it or --reschedule out')
@@ -119,7 +119,7 @@ def as_recorded(
 ) -> Replay:
     """Replay a recorded run, or the part of it from ``begin`` to ``end``."""
     from mddag_executor.replay import replay
-    span = span_of(begin, end, skip)
+    span = span_of(begin, end)
     if source.is_bag:
         raise source.no_graph()
     with Progress(doing) as line:
@@ -127,12 +127,10 @@ def as_recorded(
                       skip=skip, span=span)
 
 
-def span_of(begin: int | None, end: int | None, skip: int = 0) -> tuple[int, int] | None:
+def span_of(begin: int | None, end: int | None) -> tuple[int, int] | None:
     """Return the part of the recording that `--from` and `--to` name, None for all of it."""
     if begin is None and end is None:
         return None
-    if skip:
-        raise UsageError('--skip: the part begins with --from: leave one of them out')
     span = begin or 0, end or 2 ** 62
     if span[0] >= span[1]:
         raise UsageError('--to: the part ends before it begins: give a time after --from')
@@ -142,10 +140,10 @@ def span_of(begin: int | None, end: int | None, skip: int = 0) -> tuple[int, int
 def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
     """Reschedule a recording if that is wanted or it is a bag; else replay it as recorded."""
     if not args.reschedule and not source.is_bag:
-        return as_recorded(source, skip=args.skip, begin=args.begin, end=args.end)
+        return as_recorded(source, begin=args.begin, end=args.end)
     settings = {
         'policy': args.policy, 'workers': args.workers, 'preemptive': args.preemptive,
-        'on_late': args.on_late, 'skip': args.skip, 'cpus': args.cpus, 'name': source.name}
+        'on_late': args.on_late, 'skip': args.begin or 0, 'cpus': args.cpus, 'name': source.name}
     if source.is_bag:
         return _rescheduled_bag(args, source, settings)
     options.refuse(args, ('execution_times', 'seed'),

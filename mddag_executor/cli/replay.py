@@ -27,6 +27,8 @@ mddag replay run.mcap --from 90s --to 100s --report part.html
 mddag replay drive/ graph.yaml --reschedule --execution-times measured.json
 mddag replay run.mcap --fail-on-miss --junit junit.xml"""
 
+REMOVED_OPTIONS = {'--skip': 'it is --from now'}
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
@@ -40,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='print an annotation for GitHub Actions for each sink that missed more than that')
     add('--junit', metavar='OUT.xml', type=options.Output,
         help="write JUnit XML, a test case for each sink ('-': to standard output)")
-    options.add(parser, '--from', '--to', '--skip', '--report', '--json')
+    options.add(parser, '--from', '--to', '--report', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -58,6 +60,8 @@ def main(args: argparse.Namespace) -> int:
         from mddag_executor.report.html import of_outcome
         common.write_report(args.report, of_outcome(outcome, result))
     common.show(args, result, _lines(args, result))
+    if not args.fail_on_miss:
+        verdicts.check_judged(result['dags'], str(args.trace))
     return status
 
 

@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 EXAMPLE = """\
 mddag rerun drive.mcap graph.yaml --node my_package/tracker -o before.mcap
 mddag rerun drive.mcap graph.yaml --node my_package/tracker --expect before.mcap
-mddag rerun drive.mcap graph.yaml --node my_package.tracker:main --times run.mcap --workers 2
+mddag rerun drive.mcap graph.yaml --node my_package.tracker:main --execution-times run.mcap
 
 exit status: 0 done; 1 the outputs are not those of --expect; 2 bad input; 70 a node raised"""
 
 _PROGRAMS = ('mddag', 'ros2')  # wherever pip, colcon or a user has put them
 _MODULE = 'mddag_executor/__main__.py'
+
+REMOVED_OPTIONS = {
+    '--times': 'it is --execution-times now', '--tolerance': 'it is --allow-difference now'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,10 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--expect', metavar='OUT.mcap', type=options.Input,
         help='compare what the nodes publish with this bag, and exit with status 1 if it '
         'differs')
-    add('--tolerance', type=options.share, default=0.0, metavar='X',
+    add('--allow-difference', type=options.share, default=0.0, metavar='X',
         help='with --expect: floating-point numbers may differ by this much, or by this share of '
         'the larger one (default: 0)')
-    add('--times', metavar='WHICH', type=options.Input,
+    add('--execution-times', metavar='WHICH', type=options.Input,
         help='how long callbacks take: recorded (the default for a trace), declared (the default '
         'for a bag), or a file: a trace, or JSON with execution times')
     options.add(parser, '--cpus', otherwise='as many as are needed')
@@ -103,7 +106,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     task_set = common.load_graph(args.graph)
     path, name = common.input_path(args.recording)
     with ExitStack() as files:
-        messages, times = open_input(path, task_set, args.times, args.seed, name)
+        messages, times = open_input(path, task_set, args.execution_times, args.seed, name)
         output: BinaryIO | None = None
         if args.output is not None:
             output = files.enter_context(common.output_file(args.output))
@@ -120,7 +123,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
                 lambda done: line.update(done / 1e9))
         if args.expect is None:
             return result, None
-        return result, compare(result, args.expect, args.tolerance)
+        return result, compare(result, args.expect, args.allow_difference)
 
 
 def _lines(

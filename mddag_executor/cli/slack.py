@@ -31,6 +31,7 @@ mddag slack config/autoware.yaml --utilisation 0.6 --workers 6
 mddag slack run.mcap --fail-under 1.2 --json slack.json --report slack.html"""
 
 _ONLY_GRAPH = ('duration', 'execution_times', 'seed', 'utilisation')
+REMOVED_OPTIONS = {'--jobs': 'it is --parallel now', '--skip': 'it is --from now'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,14 +46,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--preemptive', otherwise='as recorded')
     options.add(parser.add_argument_group('with GRAPH'), *(
         f'--{name.replace("_", "-")}' for name in _ONLY_GRAPH), default=None)
-    add('--jobs', type=options.positive_int, metavar='N',
+    add('--parallel', type=options.positive_int, metavar='N',
         help='how many processes search (default: one for each processor)')
     add('--fail-under', type=options.positive_float, metavar='FACTOR',
         help='exit with status 1 if some callback may not take this many times as long, if a '
         'deadline is missed already, or if no job was due')
     add('--report', metavar='OUT.html', type=options.Output,
         help="write the tables with bars as one HTML file ('-': to standard output)")
-    options.add(parser, '--skip', '--json')
+    options.add(parser, '--from', '--json')
 
 
 def main(args: argparse.Namespace) -> int:
@@ -64,7 +65,7 @@ def main(args: argparse.Namespace) -> int:
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
     with Progress('searching', callbacks) as line:
-        slack = find_slack(problem, line.update, args.jobs or defaults.processors())
+        slack = find_slack(problem, line.update, args.parallel or defaults.processors())
     result = slack_result(slack, task_set, dags, problem.settings.processes)
     if args.report is not None:
         common.write_text(args.report, ''.join(page(result, str(args.trace))))
@@ -90,8 +91,8 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     with Progress('replaying') as line:
         outcome = reschedule(
             source.path, source.task_set, policy=args.policy, workers=args.workers,
-            preemptive=args.preemptive, name=source.name, progress=line.events, skip=args.skip,
-            cpus=args.cpus)
+            preemptive=args.preemptive, name=source.name, progress=line.events,
+            skip=args.begin or 0, cpus=args.cpus)
     warn(*outcome.warnings)
     work = outcome.work
     problem = Problem(work.load, outcome.settings, outcome.tables,
@@ -107,8 +108,8 @@ def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     if args.graph is not None:
         raise UsageError(f'{args.graph}: there is a declaration already: give one, or a trace '
                          'before it')
-    if args.skip:
-        raise UsageError('--skip: a simulation needs no warm-up: leave the option out')
+    if args.begin:
+        raise UsageError('--from: a simulation needs no warm-up: leave the option out')
     task_set = common.load_graph(args.trace)
     workers = defaults.workers(args.workers, task_set)
     args.seed = args.seed or 0

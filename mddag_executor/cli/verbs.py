@@ -21,19 +21,18 @@ TASKS = {
         'diff': 'compare two recorded runs sink by sink',
         'export': 'turn a recording into files for Perfetto or for data frames',
         'import ctf': 'turn a CARET or ros2_tracing recording (LTTng) into a trace'},
-    'Plan': {
+    'Declare': {
         'graph check': 'validate a declaration, show its DAGs and whether the deadlines can hold',
         'graph draw': 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)',
         'graph from-trace': 'make a declaration to fill in from a recorded run',
         'graph from-caret': 'make a declaration to fill in from a CARET architecture file',
-        'graph place': 'pack the nodes into processes, so that each needs Python little'},
+        'graph place': 'pack the nodes into processes, so that each needs Python little',
+        'graph schema': 'print the JSON Schema of declarations, for editors'},
     'Laboratory': {
         'simulate': 'run a declaration in virtual time',
         'evaluate': 'measure acceptance ratios over many simulated runs',
         'generate': 'make random multi-deadline, multi-rate DAG sets',
         'graph assign-deadlines': 'give the sinks deadlines, by critical path or by search'},
-    'Develop': {
-        'graph schema': 'print the JSON Schema of declarations, for editors'},
 }
 VERBS = {verb: summary for verbs in TASKS.values() for verb, summary in verbs.items()}
 # What to do instead of a verb that earlier versions had.

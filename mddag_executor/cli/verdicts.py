@@ -11,11 +11,12 @@ from typing import Any
 
 from mddag_executor.cli import common
 from mddag_executor.cli.text import one_line
-from mddag_executor.core.tally import total
+from mddag_executor.core.tally import never_due, total
 from mddag_executor.core.tolerances import not_tolerated, NOTHING_DUE
+from mddag_executor.errors import InputError
 
-_NEVER_DUE = ('give a declaration whose nodes, topics and namespaces are those that ran, and a '
-              'run that is longer than its deadlines')
+_NEVER_DUE = ('check that the declaration has the nodes, topics and namespaces of the run, and '
+              'record for longer than its deadlines')
 
 
 def judge(args: argparse.Namespace, result: dict[str, Any]) -> int:
@@ -46,6 +47,12 @@ def exit_status(
     if total(dags).due:
         return int(bool(not_tolerated(dags)))
     return unproven(place, NOTHING_DUE, remedy)
+
+
+def check_judged(dags: Mapping[str, Any], place: str) -> None:
+    """Raise an error if a declaration has sinks with deadlines, and no job was due at any."""
+    if never_due(dags) and not total(dags).due:
+        raise InputError(place, NOTHING_DUE, _NEVER_DUE)
 
 
 def unproven(place: str, what: str, remedy: str = _NEVER_DUE) -> int:

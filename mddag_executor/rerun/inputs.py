@@ -125,8 +125,8 @@ def open_input(
         times = DECLARED if is_bag else RECORDED
     if times == RECORDED and is_bag:
         raise UsageError(
-            f'--times recorded: {name} is a bag, which does not say how long callbacks took: give '
-            '--times declared, or a trace or a file of execution times')
+            f'--execution-times recorded: {name} is a bag, which does not say how long callbacks '
+            'took: give --execution-times declared, or a trace or a file of execution times')
     run = None if is_bag else open_recording(path, task_set, name)
     if times == DECLARED:
         taken = _fixed(task_set, draw_execution_times(task_set, seed, undeclared=0))

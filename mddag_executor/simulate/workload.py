@@ -32,7 +32,7 @@ def check_execution_times(task_set: TaskSet, otherwise: str = '') -> None:
     """
     Check that each callback declares an execution time.
 
-    :param otherwise: what else to do about it, as ``, or give --samples FILE.npz``.
+    :param otherwise: what else to do about it, as ``, or give --execution-times FILE.npz``.
     :raises InputError: it names the first one that does not.
     """
     missing = [each for each in task_set.callbacks if each.execution_time is None]

@@ -22,7 +22,8 @@ def test_figure(graph, tmp_path, call, ending, start):
     """It is a picture of that kind, and the same for the same runs."""
     pictures = []
     for name in (f'one.{ending}', f'two.{ending.upper()}'):
-        assert call('evaluate', graph, graph, '--runs', 20, '--plot', name, '--jobs', 1)[0] == 0
+        done = call('evaluate', graph, graph, '--runs', 20, '--plot', name, '--parallel', 1)
+        assert done.returncode == 0
         pictures.append((tmp_path / name).read_bytes())
     assert pictures[0].startswith(start) and pictures[0] == pictures[1]
     if ending == 'svg':
@@ -37,7 +38,7 @@ def test_interrupted(graph, compiled):
         pytest.importorskip('numba')
     with subprocess.Popen(
             [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '500000',
-             '--jobs', '1', '--json', 'out.json', '--plot', 'out.png'],
+             '--parallel', '1', '--json', 'out.json', '--plot', 'out.png'],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
             env={**os.environ, 'NUMBA_DISABLE_JIT': str(int(not compiled)),
                  'NUMBA_CACHE_DIR': str(graph.parent / 'cache')}) as process:

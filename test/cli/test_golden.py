@@ -40,19 +40,19 @@ COMMANDS = {
         '--json out.json'),
     'place': 'graph place graph.yaml --processes 2 -o out.yaml',
     'place_json': 'graph place graph.yaml --processes 2 --json - -o out.yaml',
-    'place_trace': 'graph place graph.yaml --processes 2 --trace own.mcap -o -',
+    'place_trace': 'graph place graph.yaml own.mcap --processes 2 -o -',
     'generate': 'generate --dags 2 --vertices 3:5 --sinks 2 --or-share 0.5 --seed 4',
     'simulate': 'simulate graph.yaml --duration 200ms',
     'simulate_options': '; '.join(f'simulate graph.yaml --duration 200ms {how}' for how in (
         '--execution-times times.json', '--judge completions', '--preemptive',
         '--on-late demote', '--stop-at-first-miss --report out.html')),
     'simulate_json': 'simulate graph.yaml --duration 200ms --policy fifo --json -',
-    'evaluate': 'evaluate graph.yaml --runs 30 --policies rad,fifo --jobs 1 --duration 200ms',
-    'evaluate_json': 'evaluate graph.yaml --runs 30 --policies rad --jobs 1 --json -',
+    'evaluate': 'evaluate graph.yaml --runs 30 --policies rad,fifo --parallel 1 --duration 200ms',
+    'evaluate_json': 'evaluate graph.yaml --runs 30 --policies rad --parallel 1 --json -',
     'evaluate_several': (
         'generate --sets 2 --utilisation 0.2:0.6 --workers 2 -o sets; '
         'evaluate graph.yaml sets --runs 5 --policies rad --no-preemptive --duration 100ms '
-        '--jobs 1 --json -'),
+        '--parallel 1 --json -'),
     'draw_dot': 'graph draw picture.yaml -o out.dot',
     'draw_mermaid': 'graph draw picture.yaml -o out.mmd',
     'draw_autoware': 'graph draw - -o out.mmd < ROOT/config/autoware.yaml',
@@ -64,17 +64,17 @@ COMMANDS = {
         'graph from-trace odd.mcap --accept -o out.yaml; replay odd.mcap out.yaml'),
     'within_a_process': (
         'graph from-trace within.mcap --accept -o out.yaml; replay within.mcap out.yaml; '
-        'graph from-caret architecture.yaml --trace within.mcap'),
+        'graph from-caret architecture.yaml within.mcap'),
     'import_ctf': 'import ctf session -o drive_2.mcap',
     'explain': 'explain run.mcap --json out.json',
     'explain_job': 'explain run.mcap --sink filter:run --job 2 --json out.json',
-    'slack': 'slack run.mcap --jobs 1 --json out.json',
+    'slack': 'slack run.mcap --parallel 1 --json out.json',
     'diff': 'diff run.mcap run.mcap tight.yaml --callbacks --json out.json',
     'diff_tolerance': 'diff run.mcap slow.mcap tolerant.yaml',
     'diff_status': '; '.join(f'diff {words} --fail-on-worse' for words in (
         'slow.mcap run.mcap', 'run.mcap slow.mcap', 'run.mcap slow.mcap wide.yaml',
-        'run.mcap slow.mcap tight.yaml', 'run.mcap slow.mcap wide.yaml --tolerance 5%',
-        'run.mcap slow.mcap wide.yaml --tolerance 1.0')),
+        'run.mcap slow.mcap tight.yaml', 'run.mcap slow.mcap wide.yaml --allow-growth 5%',
+        'run.mcap slow.mcap wide.yaml --allow-growth 1.0')),
     'diff_kinds': '; '.join(f'diff {words}' for words in (
         'own.mcap drive.mcap --json out.json', 'drive.mcap own.mcap',
         'drive.mcap drive.mcap seen.yaml')),

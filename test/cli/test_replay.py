@@ -41,7 +41,7 @@ def test_a_truncated_trace_gives_what_is_there(trace, call):
 
 
 def test_standard_input(trace, call):
-    assert call('replay', '-', stdin=trace.read_bytes()) == call('replay', trace, '--skip', '0s')
+    assert call('replay', '-', stdin=trace.read_bytes()) == call('replay', trace, '--from', '0s')
     status, out, err = call('replay', '-', '--json', '-', stdin=trace.read_bytes()[:-40])
     assert err.startswith('warning: <stdin>: the summary')
     assert json.loads(out)['recording']['trace'] == '<stdin>'
@@ -64,3 +64,18 @@ def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(call, folder):
     for name, says in ((':t', "':t' may be any of '/a/one:t', '/b/two:t': write more of it"),
                        ('ona:t', "there is no sink 'ona:t': did you mean '/a/one:t'?")):
         assert call('explain', 'r.mcap', '--sink', name) == (2, '', f'error: --sink: {says}\n')
+
+
+def test_a_run_in_which_nothing_was_due_is_not_judged(tmp_path, call):
+    """The status is 2, as with the declaration of another robot."""
+    graph, trace = tmp_path / 'graph.yaml', tmp_path / 'run.mcap'
+    graph.write_text(
+        'mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n'
+        '      - {name: tick, timer: 10s, publishes: [/a], execution_time: 50ms}\n'
+        '      - {name: done, subscription: /a, deadline: 9s, execution_time: 50ms}\n')
+    assert call('simulate', graph, '--duration', '20ms', '--trace', trace).returncode == 0
+    for verb in ('replay', 'explain'):
+        done = call(verb, trace)
+        assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith(
+            f'error: {trace}: no job was due at any sink, so no deadline was judged: '), done
+    assert call('replay', trace, '--fail-on-miss').returncode == 1

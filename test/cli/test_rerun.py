@@ -67,7 +67,7 @@ def test_a_run_and_its_result(drive, tmp_path):
         mddag(tmp_path, *expect, '--json', '-', status=1).stdout)['differences']
     assert (difference['topic'], difference['field'], difference['number']) == (
         '/track', 'data', 1)
-    mddag(tmp_path, *expect, '--tolerance', '1%')
+    mddag(tmp_path, *expect, '--allow-difference', '1%')
 
 
 @pytest.mark.slow

@@ -96,5 +96,5 @@ def test_samples_are_no_pickles(call, tmp_path, key):
     np.savez(tmp_path / 'samples.npz', **{str(key): np.array([Owner()], dtype=object)})
     if key is None:
         (tmp_path / 'samples.npz').write_bytes(b'\x80\x04cos\nsystem\n(S"touch owned"\ntR.')
-    refused(call('evaluate', 'graph.yaml', '--runs', '2', '--samples', 'samples.npz',
+    refused(call('evaluate', 'graph.yaml', '--runs', '2', '--execution-times', 'samples.npz',
                  cwd=tmp_path), tmp_path)

@@ -39,7 +39,7 @@ VERBS = (
     ('graph', 'assign-deadlines', '--runs', '2', '--duration', '300us', '-o', 'out.yaml'),
     ('simulate', '--duration', '300us', '--workers', '2'),
     ('simulate', '--duration', '300us', '--policy', 'llf', '--preemptive', '--trace', 'out.mcap'),
-    ('evaluate', '--runs', '2', '--duration', '300us', '--policies', 'rad', '--jobs', '1'),
+    ('evaluate', '--runs', '2', '--duration', '300us', '--policies', 'rad', '--parallel', '1'),
 )
 
 

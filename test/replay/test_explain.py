@@ -337,10 +337,14 @@ nodes:
     sinks = {name: next(iter(dag['sinks'].values()))
              for name, dag in run.result()['dags'].items()}
     assert 'demoted' not in sinks['a'] and sinks['b']['demoted'] > 70
-    lines = call('replay', trace, '--skip', '100s').stdout.splitlines()
+    none = call('replay', trace, '--from', '100s')
+    assert (none.returncode, none.stderr) == (
+        2, f'error: {trace}: it ends 3.000 s after its first release: give an earlier time\n')
+    rescheduled = call('replay', trace, '--reschedule', '--from', '100s')
     assert 'left out: jobs released in the first 100 s, so all of them: the run has only 3 s' \
-        in lines
-    assert '0 results due, 0 in time (-), 0 late, 0 expired' in lines   # and none demoted
+        in rescheduled.stdout.splitlines()
+    assert '0 results due, 0 in time (-), 0 late, 0 expired' in rescheduled.stdout
+    assert 'no job was due at any sink' in rescheduled.stderr and rescheduled.returncode == 2
     explained = call('explain', trace, '--json', '-').result
     # all there is no time for
     assert explained['missed'] == explained['causes']['less important'] >= 50

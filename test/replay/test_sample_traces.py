@@ -49,7 +49,7 @@ IMPORTED = CAMERA + """\
 paths:
   - {name: p, callbacks: ['/camera:grab', '/detect:run']}
 """
-RESCHEDULED = '--reschedule --workers 1 --policy fifo --overheads none --skip 50ms'
+RESCHEDULED = '--reschedule --workers 1 --policy fifo --overheads none --from 50ms'
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +73,7 @@ def files(tmp_path, monkeypatch):
     ('virtual_run_rescheduled', f'v1.mcap {RESCHEDULED}'),
     ('virtual_run_other_declaration', 'v7.mcap other0.yaml'),
     ('ordinary_bag', 'bag_mcap bagh.yaml --reschedule --workers 1 --policy rm --preemptive '
-     '--overheads 1ms --skip 200ms')])
+     '--overheads 1ms --from 200ms')])
 def test_the_result_is_that_of_version_1(name, arguments):
     assert program.main(['replay', *arguments.split(), '--json', 'found.json']) == 0
     found = json.loads(Path('found.json').read_text())

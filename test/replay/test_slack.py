@@ -28,7 +28,7 @@ def test_by_hand(tmp_path, call):
     graph, trace = tmp_path / 'g.yaml', tmp_path / 't.mcap'
     graph.write_text(BY_HAND)
     call('simulate', graph, '--trace', trace, '--duration', '1s')
-    result = call('slack', trace, '--jobs', 1, '--json', '-').result
+    result = call('slack', trace, '--parallel', 1, '--json', '-').result
     factors = {name: one['factor'] for name, one in result['callbacks'].items()}
     assert 5.94 <= factors['/a:first'] <= 6
     assert 3.46 <= factors['/b:last'] <= 3.5
