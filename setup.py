@@ -98,7 +98,6 @@ setup(
         (f'lib/{NAME}', ['resource/mddag']),
         (f'share/{NAME}/launch', files('launch', '*.launch.py')),
         (f'share/{NAME}/config', files('config', '*.yaml', '*.md')),
-        (f'share/{NAME}/examples/robot', files('examples/robot', '*.yaml', '*.py')),
         (f'share/{NAME}/bags', files('bags', '*.mcap', '*.md')),
     ],
     # The ROS packages are not among these: with an installed ROS they come from rosdep, and the

@@ -96,6 +96,18 @@ def test_addresses_are_in_one_place_and_filled_in_at_a_tag():
         'package.xml: fill in the maintainer and the addresses before a release')
 
 
+def test_the_changelog_for_bloom_has_the_released_versions():
+    text = subprocess.run(
+        [sys.executable, TOP / '.ci' / 'changelog_rst'], text=True, capture_output=True,
+        check=True).stdout
+    markdown = (TOP / 'CHANGELOG.md').read_text(encoding='utf-8')
+    versions = re.findall(r'^## (\d\S+) - (\S+)$', markdown, re.MULTILINE)
+    assert versions and re.findall(r'^(\d\S+) \((\S+)\)\n-+$', text, re.MULTILINE) == versions
+    assert text.startswith('^^^') and 'Unreleased' not in text
+    assert not re.search(r'(?<!`)`(?!`)[^`<]*`(?!`)(?!_)|\]\(|^#|^- ', text, re.MULTILINE)
+    assert len(re.findall(r'^\* ', text, re.MULTILINE)) > 50
+
+
 def test_a_project_page_has_links_that_work_everywhere():
     done = subprocess.run(
         [sys.executable, 'setup.py', '--quiet', '--long-description'], cwd=TOP, text=True,
