@@ -12,9 +12,8 @@ from mddag_executor.text import counted
 
 DESCRIPTION = """\
 Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes and events, into a
-trace. It is read with the Python bindings of babeltrace2 (apt install python3-bt2), in whichever
-Python of this machine has them. Several sessions of one run, of one or several computers, become
-one trace."""
+trace. No other program is needed. Several sessions of one run, of one or several computers, become
+one trace; what is damaged is read up to the damage."""
 EXAMPLE = """\
 mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap
 mddag replay drive.mcap graph.yaml"""

@@ -161,6 +161,25 @@ def fixed_layout(types: Sequence[FieldType]) -> str | None:
     return ''.join(layout)
 
 
+def fixed_places(types: Sequence[FieldType]) -> tuple[list[tuple[str, int]], int] | None:
+    """
+    Return numpy's name and the offset of each field, and the size, of a message of known size.
+
+    :returns: None if a field is a string or a sequence, whose size is not known.
+    """
+    places, position = list[tuple[str, int]](), 0
+    for kind in types:
+        count = 1 if kind.count is None else kind.count
+        if kind.base == 'string' or count < 1:
+            return None
+        size = _SIZES[kind.base]
+        position += -position % size
+        code = f'<{_CODES[kind.base]}'
+        places.append((code if kind.count is None else f'({count},){code}', position))
+        position += size * count
+    return places, position
+
+
 def encode(types: Sequence[FieldType], values: Sequence[Any]) -> bytes:
     """
     Return the message without its encapsulation header.

@@ -5,9 +5,8 @@ Imports CARET and ros2_tracing recordings: LTTng sessions in the Common Trace Fo
 
 Theory of operation:
 
-1. babeltrace2 reads the session, through its Python bindings in a separate process (`ctf_helper`),
-   because the bindings usually belong to the system's Python and abort on some damage. Python
-   interpreters are tried one after the other, the running one first, until one has the bindings.
+1. The packets of the session are read here, on columns (`tsdl`, `ctf_layout`, `ctf_stream`); no
+   other program is needed.  What is damaged is read up to the damage, with a warning.
 2. All traces of a session (processes, kernel, rotated chunks) are read as one stream in the order
    of time, and so are several sessions of one host: the metadata has its name, and the UUID of its
    clock, which is that of its boot.  The sessions of several hosts are written one after the
@@ -26,7 +25,7 @@ Theory of operation:
    hosts and containers are changed (`numbers`).  An event `mddag:process` with `procname` precedes
    the first event of a thread, and each change of its name.
 5. Events discarded by the tracer become an event `mddag:lost` at the end of the gap; a lost packet
-   counts as at least one event, and a warning reports it.
+   counts as at least one event, and a warning reports it.  So does damage.
 6. A tracepoint writes to all sessions that record it before its thread goes on.  So an event that
    equals the one before it in its thread, and that another session recorded, is the same event: it
    is written once (`_Repeats`).
@@ -34,22 +33,28 @@ Theory of operation:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-import json
 import os
 from pathlib import Path
 import re
-import shutil
-import signal
 import struct
-import subprocess
-import sys
-from typing import Any, IO, NamedTuple
+from typing import Any, NamedTuple
 
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
-from mddag_executor.trace.ctf_helper import PATIENCE_S
+from mddag_executor.trace.columns import Columns, ColumnWriter
+from mddag_executor.trace.ctf_layout import text_of
+from mddag_executor.trace.ctf_stream import (
+    Array,
+    described,
+    Events,
+    Ints,
+    Kind,
+    Lost,
+    Reading,
+    Rows,
+)
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import (
@@ -59,19 +64,20 @@ from mddag_executor.trace.schema import (
     EVENTS,
     EventType,
     PREAMBLE,
+    PROCESS,
 )
 from mddag_executor.trace.trace_file import TraceFile, whole_trace
+from mddag_executor.trace.tsdl import Metadata, parse_tsdl, TsdlError
+import numpy as np
 
-INSTALL = 'apt install python3-bt2'
-_HELPER = Path(__file__).with_name('ctf_helper.py')
 _CACHE = 'caret_converted'
 _RECORD = 'check the recording, or record it again'
-_UNREADABLE = 'check the recording (CTF 2 needs babeltrace2 2.1), or record it again'
+_LOST = 'mddag:lost'
 
 # When sessions take turns, one or two events of each thread may look strange.
 _STRANGE = 100
+_MOST_DAMAGES = 5
 
-Row = list[Any]
 _Thread = tuple[int, int, int]
 Converters = list[Callable[[Any], Any] | None]
 
@@ -120,7 +126,7 @@ def import_ctf(
     :param output: the trace; after an exception what was there before is there
     :param progress: called regularly with the number of events
     :param overwrite: whether an existing file may be replaced
-    :raises TraceError: if the session or the file cannot be used, or babeltrace2 is missing
+    :raises TraceError: if the session or the file cannot be used
     """
     paths = [os.fspath(path) for path in (
         [session] if isinstance(session, (str, os.PathLike)) else session)]
@@ -147,24 +153,41 @@ def _written(
     with whole_trace(output, overwrite) as part, TraceFile(part, overwrite=True) as file:
         importer = _Importer(name, file)
         for sessions in hosts:
-            importer.begin(several=sum(each.parts for each in sessions) > 1)
-            for row in _rows([each.path for each in sessions]):
-                importer.take(row)
-                events = importer.result.events
-                if progress is not None and row[0] == 'event' and events % 5000 == 0:
-                    progress(events)
-        if importer.result.events == 0:
-            raise TraceError(name, 'no event is recorded in it', _RECORD)
+            several = sum(each.parts for each in sessions) > 1
+            importer.begin(several)
+            reading = Reading({folder: _metadata_in(folder) for each in sessions
+                               for folder in each.traces}, raw=several)
+            for events, lost in reading.batches():
+                importer.take(events, lost)
+                if progress is not None:
+                    progress(importer.result.events)
+            importer.damages += described(reading.damages)
         importer.finish()
     return importer.result
+
+
+def _metadata_in(folder: str) -> Metadata:
+    """
+    Return what the metadata in a folder says.
+
+    :raises TraceError: if it is not understood
+    """
+    path = os.path.join(folder, 'metadata')
+    text = _text_of_metadata(path)
+    if text.lstrip()[:1] in (b'\x1e', b'{'):
+        raise TraceError(path, 'is in CTF 2, which is not read',
+                         'record with lttng create --trace-format=ctf-1.8')
+    try:
+        return parse_tsdl(text)
+    except TsdlError as error:
+        raise TraceError(path, f'cannot be read ({error})', _RECORD) from None
 
 
 def _session_in(path: str) -> _Session:
     """
     Return the session in a folder.
 
-    :raises TraceError: if there is none, or several; babeltrace2's own message would be unclear,
-        and it hangs on cut metadata
+    :raises TraceError: if there is none, or several
     """
     remedy = 'name the folder that LTTng recorded to, such as ~/.ros/tracing/SESSION'
     if '\0' in path or not os.path.exists(path):
@@ -234,7 +257,7 @@ def _text_of_metadata(path: str) -> bytes:
     order = next((order for order in '<>' if data[:4] == struct.pack(f'{order}I', _MAGIC)), None)
     if order is None:
         return data
-    head, text, position = struct.Struct(f'{order}I{_PACKET}'), b'', 0
+    head, parts, position = struct.Struct(f'{order}I{_PACKET}'), [], 0
     while position < len(data):
         packet = data[position:position + head.size].ljust(head.size, b'\0')
         magic, _, _, content, size, *_ = head.unpack(packet)
@@ -242,88 +265,12 @@ def _text_of_metadata(path: str) -> bytes:
                 position + size // 8 > len(data)):
             raise TraceError(
                 path, f'the metadata is cut or damaged at byte {position}', _RECORD)
-        text += data[position + head.size:position + content // 8]
+        parts.append(data[position + head.size:position + content // 8])
         position += size // 8
-    return text
+    return b''.join(parts)
 
 
-# --- the helper process --------------------------------------------------------------------------
-
-
-def interpreters() -> list[str]:
-    """Return the Python interpreters that may have babeltrace2's bindings, this one first."""
-    system = sorted(str(path) for path in Path('/usr/bin').glob('python3.[0-9]*')
-                    if re.fullmatch(r'python3\.\d+', path.name))
-    found = [sys.executable, '/usr/bin/python3', shutil.which('python3'), *reversed(system)]
-    return list(dict.fromkeys(name for name in found if name and os.access(name, os.X_OK)))
-
-
-def _rows(paths: list[str]) -> Iterator[Row]:
-    """Yield the rows of the sessions of a host from the first Python interpreter with bindings."""
-    for interpreter in interpreters():
-        rows = _rows_of(interpreter, paths)
-        first = next(rows, None)
-        if first is not None and first[0] == 'ready':
-            yield from rows
-            return
-        rows.close()
-    raise TraceError(
-        ', '.join(paths), "babeltrace2's Python bindings, which read it, are not installed",
-        INSTALL)
-
-
-def _rows_of(interpreter: str, paths: list[str]) -> Generator[Row, None, None]:
-    path = ', '.join(paths)
-    # PYTHONHOME of one interpreter breaks another. Without bytecode nothing is written.
-    environment = {name: value for name, value in os.environ.items() if name != 'PYTHONHOME'}
-    environment['PYTHONDONTWRITEBYTECODE'] = '1'
-    try:
-        process = subprocess.Popen(
-            [interpreter, str(_HELPER), *map(os.path.abspath, paths)], env=environment,
-            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-    except OSError:
-        return      # try the next interpreter
-    assert process.stdout is not None
-    ready = False
-    try:
-        for row in _read(process.stdout):
-            if row[0] == 'error':
-                raise TraceError(path, f'cannot be read ({row[1]})', _UNREADABLE)
-            if row[0] == 'end':
-                return
-            ready = ready or row[0] == 'ready'
-            yield row
-        if ready:
-            raise TraceError(path, f'babeltrace2 gave up ({_end_of(process)})', _UNREADABLE)
-    finally:
-        process.kill()
-        process.stdout.close()
-        process.wait()
-
-
-def _read(stream: IO[bytes]) -> Iterator[Row]:
-    """Yield all rows, up to the end of the stream or the first line that is not the helper's."""
-    for line in stream:
-        try:
-            row = json.loads(line)
-        except ValueError:
-            return
-        if not isinstance(row, list) or not row:
-            return
-        yield row
-
-
-def _end_of(process: subprocess.Popen[bytes]) -> str:
-    try:
-        status = process.wait(10)
-    except subprocess.TimeoutExpired:
-        return 'it does not answer'
-    if status == -signal.SIGALRM:
-        return f'it did nothing for {PATIENCE_S} s'
-    return f'exit status {status}' if status >= 0 else f'ended by {signal.Signals(-status).name}'
-
-
-# --- from rows to events -------------------------------------------------------------------------
+# --- from columns to a trace ---------------------------------------------------------------------
 
 
 class _OtherHosts(Exception):
@@ -342,22 +289,22 @@ class _Several:
     def __init__(self) -> None:
         self.repeated = 0
         self._strange = 0
-        self._last: dict[_Thread, tuple[str, list[Any], set[int]]] = {}     # and its traces
+        self._last: dict[_Thread, tuple[str, bytes, set[int]]] = {}     # and its traces
         self._kinds: set[tuple[int, str]] = set()
-        self._named: dict[tuple[int, int], dict[str, int]] = {}
+        self._named: dict[tuple[int, int], dict[bytes, int]] = {}
         self._which: dict[tuple[int, int], int] = {}
 
-    def process(self, trace: int, vpid: int, vtid: int, procname: str | None) -> int:
+    def process(self, trace: int, vpid: int, vtid: int, procname: bytes) -> int:
         """Return which of the processes with an id an event belongs to."""
         names = self._named.setdefault((vpid, vtid), {})
         which = self._which.get((trace, vpid))
         if which is None:
-            which = names.get(procname or '', len(set(names.values())))
+            which = names.get(procname, len(set(names.values())))
             self._which[trace, vpid] = which
-        names.setdefault(procname or '', which)
+        names.setdefault(procname, which)
         return which
 
-    def is_repeat(self, thread: _Thread, trace: int, name: str, values: list[Any]) -> bool:
+    def is_repeat(self, thread: _Thread, trace: int, name: str, values: bytes) -> bool:
         """
         Return whether an event is the last one of its thread, recorded by another session.
 
@@ -378,24 +325,39 @@ class _Several:
         return False
 
 
+class _Target(NamedTuple):
+    """
+    A kind of event in the trace.
+
+    :ivar kind: the kind in the session.
+    :ivar event: its name for the writer.
+    """
+
+    kind: Kind
+    event: str
+    converters: Converters
+
+
 class _Importer:
-    """Writes the rows of the sessions of a run as events, those of one host after another."""
+    """Writes the events of the sessions of a run, those of one host after another."""
 
     def __init__(self, path: str, file: TraceFile) -> None:
         self.result = Imported()
+        #: What is wrong in files, one line each.
+        self.damages: list[str] = []
         self._path = path
         self._file = file
+        self._writer = ColumnWriter(file)
         self._place = 0             # number of the host
         self._several: _Several | None = None       # if the host has several sessions
         self._repeated = 0
         self._processes, self._threads = Numbers(), Numbers()
-        # by number of an event's class: its name, the converters of its values, and its trace
-        self._kinds: dict[int, tuple[str, Converters, int]] = {}
-        self._names: set[str] = set()       # of events
-        self._procnames: dict[tuple[int, int], str] = {}
+        self._targets: dict[int, _Target] = {}      # by identity of the kind
+        self._names: set[str] = set()               # of events
+        self._procnames: dict[int, bytes] = {}      # by process and thread in one number
         self._nameless = 0                          # events without process or thread
+        self._impossible = 0                        # events of impossible processes or threads
         self._uncounted = 0                         # gaps of an unknown number of events
-        self._time = 0
 
     def begin(self, several: bool) -> None:
         """
@@ -404,66 +366,144 @@ class _Importer:
         :param several: whether it has several sessions.
         """
         self._place += 1
-        self._kinds, self._time = {}, 0
         self._repeated += self._several.repeated if self._several else 0
         self._several = _Several() if several else None
 
-    def take(self, row: Row) -> None:
-        """Write a row."""
-        if row[0] == 'event':
-            self._event(*row[1:])
-        elif row[0] == 'class':
-            self._class(*row[1:])
-        elif row[0] == 'discarded':
-            self._discarded(*row[1:])
-
-    def _event(self, number: int, time: int, vpid: int | None, vtid: int | None,
-               procname: str | None, values: list[Any]) -> None:
-        if vpid is None or vtid is None:
-            self._nameless += 1
-            vpid, vtid = vpid or 0, vtid or 0
-        name, converts, trace = self._kinds[number]
-        place = self._place, 0
+    def take(self, events: Events, lost: Sequence[Lost]) -> None:
+        """Write events, which are in the order of time, and gaps up to the last of them."""
+        possible = ((events.vpid == events.vpid.astype(np.int32))
+                    & (events.vtid == events.vtid.astype(np.int32)))
+        if not possible.all():
+            self._impossible += int(np.count_nonzero(~possible))
+            events = events.picked(np.flatnonzero(possible))
+        self._nameless += int(np.count_nonzero(~events.known))
+        which = np.zeros(len(events), dtype=np.int64)
         if self._several is not None:
-            which = self._several.process(trace, vpid, vtid, procname)
-            if self._several.is_repeat((which, vpid, vtid), trace, name, values):
-                return
-            place = self._place, which
-        vpid = self._processes.of(place, vpid)
-        vtid = self._threads.of(place, vtid)
-        if procname and self._procnames.get((vpid, vtid)) != procname:
-            self._procnames[vpid, vtid] = procname
-            self._file.extend((('mddag:process', time, vtid, procname),), vpid)
-        if converts:
-            values = [value if convert is None else convert(value)
-                      for convert, value in zip(converts, values)]
-        self._file.extend(((name, time, vtid, *values),), vpid)
-        self.result.events += 1
-        self.result.processes.add(vpid)
-        self._time = time
+            which, new = self._merge(events)
+            events, which = events.picked(new), which[new]
+        vpid = self._numbered(self._processes, which, events.vpid)
+        vtid = self._numbered(self._threads, which, events.vtid)
+        self.result.events += len(events)
+        self.result.processes.update(np.unique(vpid).tolist())
+        renamed, names = self._renamed(vpid, vtid, events.procname)
+        gaps = sorted(lost)
+        # names come just before their events, gaps after all that is not later
+        keys = np.concatenate((
+            4 * np.arange(len(events)) + 2, 4 * renamed + 1,
+            4 * np.searchsorted(events.time, [gap.time for gap in gaps], side='right')))
+        order = np.empty(len(keys), dtype=np.int64)
+        order[np.argsort(keys, kind='stable')] = np.arange(len(keys))
+        of_events, of_names, of_gaps = np.split(
+            order, [len(events), len(events) + len(renamed)])
+        tables = [Columns(PROCESS, of_names, events.time[renamed], vpid[renamed], vtid[renamed],
+                          [(name,) for name in names]), self._gaps(gaps, of_gaps)]
+        merged: dict[str, list[Columns]] = {}
+        for number, rows in enumerate(events.tables):
+            if rows.count:
+                mine = np.empty(rows.count, dtype=np.int64)
+                here = np.flatnonzero(events.table == number)
+                mine[events.row[here]] = here
+                target = self._target(rows.kind)
+                merged.setdefault(target.event, []).append(Columns(
+                    target.event, of_events[mine], events.time[mine], vpid[mine], vtid[mine],
+                    self._fields(target, rows)))
+        self._writer.write([*tables, *map(_merged, merged.values())])
 
-    def _discarded(self, time: int, count: int) -> None:
-        if count < 0:
-            self._uncounted += 1
-        self.result.discarded += max(count, 1)
-        self._file.extend((('mddag:lost', max(time, self._time), 0, max(count, 1)),), 0)
+    def _merge(self, events: Events) -> tuple[Ints, Ints]:
+        """Return which of the processes of its number each event is of, and the new events."""
+        assert self._several is not None
+        process, is_repeat = self._several.process, self._several.is_repeat
+        names = [self._target(rows.kind).event if rows.count else '' for rows in events.tables]
+        found, new = [], []
+        for place, (trace, vpid, vtid, procname, table, raw) in enumerate(zip(
+                events.trace.tolist(), events.vpid.tolist(), events.vtid.tolist(),
+                events.procname.tolist(), events.table.tolist(), events.raw.tolist())):
+            which = process(trace, vpid, vtid, procname)
+            found.append(which)
+            if not is_repeat((which, vpid, vtid), trace, names[table], raw):
+                new.append(place)
+        return np.array(found, dtype=np.int64), np.array(new, dtype=np.int64)
 
-    def _class(
-        self, number: int, original: str, fields: list[tuple[str, str]], trace: int
-    ) -> None:
-        provider, colon, name = original.partition(':')
+    def _numbered(self, numbers: Numbers, which: Ints, ids: Ints) -> Ints:
+        """Return unique ids, in the order in which they are met."""
+        keys, first, inverse = np.unique(
+            which << 32 | ids & 0xFFFFFFFF, return_index=True, return_inverse=True)
+        found = np.zeros(len(keys), dtype=np.int64)
+        for at in np.argsort(first).tolist():
+            event = first[at]
+            found[at] = numbers.of((self._place, int(which[event])), int(ids[event]))
+        return found[inverse]
+
+    def _renamed(self, vpid: Ints, vtid: Ints, procname: Array) -> tuple[Ints, list[str]]:
+        """Return the events before which their thread has a new name, and the names."""
+        threads = vpid << 32 | vtid & 0xFFFFFFFF
+        order = np.argsort(threads, kind='stable')
+        thread, name = threads[order], procname[order]
+        changed = np.ones(len(order), dtype=np.bool_)
+        changed[1:] = (thread[1:] != thread[:-1]) | (name[1:] != name[:-1])
+        found = []
+        for at, key, text in zip(order[changed].tolist(), thread[changed].tolist(),
+                                 name[changed].tolist()):
+            text = text.split(b'\0', 1)[0]
+            if text and self._procnames.get(key) != text:
+                self._procnames[key] = text
+                found.append((at, text_of(text)))
+        found.sort()
+        return np.array([at for at, _ in found], dtype=np.int64), [text for _, text in found]
+
+    def _gaps(self, gaps: Sequence[Lost], order: Ints) -> Columns:
+        """Return events that say what is missing."""
+        counts = [max(gap.number, 1) for gap in gaps]
+        for gap, count in zip(gaps, counts):
+            if not gap.damage:
+                self._uncounted += gap.number < 0
+                self.result.discarded += count
+        zeros = np.zeros(len(gaps), dtype=np.int64)
+        return Columns(_LOST, order, np.array([gap.time for gap in gaps], dtype=np.int64), zeros,
+                       zeros, [np.minimum(np.array(counts, dtype=np.uint64), 2 ** 62)])
+
+    def _target(self, kind: Kind) -> _Target:
+        """Return a kind of event in the trace, which is defined when it is met."""
+        found = self._targets.get(id(kind))
+        if found is not None:
+            return found
+        provider, colon, name = kind.name.partition(':')
         if not colon:
-            provider, name = 'ctf', original
+            provider, name = 'ctf', kind.name
         key = f'{_legal(provider)}:{_legal(name)}'
         self._names.add(key)
         if key in BEFORE_HUMBLE:
             raise TraceError(self._path, BEFORE_HUMBLE_PROBLEM, BEFORE_HUMBLE_REMEDY)
-        event, converts = event_type(key, fields)
-        self._kinds[number] = self._file.define(event), converts if any(converts) else [], trace
+        event, converts = event_type(key, [(each.name, each.kind) for each in kind.fields])
+        self._targets[id(kind)] = _Target(
+            kind, self._file.define(event), converts if any(converts) else [])
+        return self._targets[id(kind)]
+
+    def _fields(self, target: _Target, rows: Rows) -> list[Array] | list[tuple[Any, ...]]:
+        """Return the fields of events of a kind as the writer wants them."""
+        if self._writer.has_columns(target.event):
+            if rows.columns is not None:
+                return rows.columns     # the writer converts them as the converters do
+            return [np.array(values, dtype=each.kind.partition('[')[0])
+                    for each, values in zip(target.kind.fields, zip(*rows.tuples))]
+        tuples = rows.tuples
+        if rows.columns is not None:
+            lists = [[text_of(each) for each in column.tolist()] if column.dtype.kind == 'S'
+                     else column.tolist() for column in rows.columns]
+            tuples = list(zip(*lists)) if lists else [()] * rows.count
+        if target.converters:
+            tuples = [tuple([value if convert is None else convert(value)
+                             for convert, value in zip(target.converters, values)])
+                      for values in tuples]
+        return tuples
 
     def finish(self) -> None:
         """Note what is missing or was changed."""
         result, path = self.result, self._path
+        if result.events == 0:
+            raise TraceError(
+                path, f'no event can be read ({self.damages[0]})' if self.damages
+                else 'no event is recorded in it', _RECORD)
         result.kinds = len(self._names)
         self._repeated += self._several.repeated if self._several else 0
         if self._repeated:
@@ -475,14 +515,32 @@ class _Importer:
             result.warnings.append(
                 f'{path}: the tracer discarded {counted(result.discarded, "event")}{about}: what '
                 'followed from them is missing; record with larger or more sub-buffers')
+        if self.damages:
+            result.warnings += self.damages[:_MOST_DAMAGES]
+            if len(self.damages) > _MOST_DAMAGES:
+                result.warnings.append(
+                    f'{path}: {len(self.damages) - _MOST_DAMAGES} more files are damaged')
         if self._nameless:
             result.warnings.append(
                 f'{path}: no process or thread is known of {counted(self._nameless, "event")}: '
                 'add the contexts vpid and vtid when recording')
-        if self._file.rejected:
+        if self._impossible:
             result.warnings.append(
-                f'{path}: left out {counted(self._file.rejected, "event")}, the first because of: '
-                f'{self._file.rejection}')
+                f'{path}: left out {counted(self._impossible, "event")} of processes or threads '
+                'that cannot be')
+
+
+def _merged(tables: Sequence[Columns]) -> Columns:
+    """Return the events of a kind as one table."""
+    first = tables[0]
+    if len(tables) == 1:
+        return first
+    order, time, vpid, vtid = (np.concatenate(each) for each in list(zip(*(
+        table[1:5] for table in tables))))
+    fields: Any = [each for table in tables for each in table.fields]
+    if fields and isinstance(fields[0], np.ndarray):
+        fields = [np.concatenate(each) for each in zip(*(table.fields for table in tables))]
+    return Columns(first.event, order, time, vpid, vtid, fields)
 
 
 def _legal(name: str) -> str:

@@ -20,7 +20,7 @@ All methods must be called by one thread; `TraceWriter` is for many threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import functools
 import os
@@ -32,7 +32,9 @@ import zlib
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
-    Channel,
+    Channel as ChannelRecord,
+)
+from mcap.records import (
     Chunk,
     ChunkIndex,
     DataEnd,
@@ -69,7 +71,7 @@ def written(what: McapRecord) -> bytes:
     return data
 
 
-class _Channel:
+class Channel:
     """The writer's state of one kind of event."""
 
     __slots__ = ('channel', 'count', 'encode', 'event', 'index', 'number', 'schema',
@@ -81,7 +83,7 @@ class _Channel:
         self.number = number            # of the channel and of its schema
         self.schema = written(
             Schema(number, event.text.encode(), 'ros2msg', schema_name))
-        self.channel = written(Channel(number, event.topic, 'cdr', {}, number))
+        self.channel = written(ChannelRecord(number, event.topic, 'cdr', {}, number))
         self.undefined = len(self.schema) + len(self.channel)   # 0 after they were written
         self.count = 0                  # messages so far
         self.index: list[int] = []      # log_time and offset of each message in the open chunk
@@ -163,7 +165,7 @@ class TraceFile:
         #: Number of events that could not be encoded, and the reason of the first.
         self.rejected = 0
         self.rejection: str | None = None
-        self._in_order = [_Channel(event, number, _schema_name(event, ()))
+        self._in_order = [Channel(event, number, _schema_name(event, ()))
                           for number, event in enumerate(EVENTS.values(), 1)]
         #: By the event's full name, and by its short name.
         self._channels = {
@@ -202,7 +204,7 @@ class TraceFile:
             key = f'{event.key}#{number}'
         if key not in self._channels:
             taken = {channel.schema_name for channel in self._in_order}
-            channel = _Channel(
+            channel = Channel(
                 event, len(self._in_order) + 1, _schema_name(event, taken, number))
             self._channels[key] = channel
             self._in_order.append(channel)
@@ -263,6 +265,40 @@ class TraceFile:
             self._records.append(message)
             self._size += len(message)
 
+    def channel(self, name: str) -> Channel:
+        """Return the channel of a kind of event, by its name for `extend`."""
+        return self._channels[name]
+
+    def room(self, channels: Iterable[Channel], wanted: int) -> int:
+        """
+        Return how many bytes of messages of some channels fit into the open chunk.
+
+        If ``wanted`` bytes do not fit, the chunk is written, and a new one opened.
+
+        :raises TraceError: if writing fails
+        """
+        undefined = sum(channel.undefined for channel in channels)
+        if self._size + undefined + wanted > CHUNK_LIMIT:
+            self.flush()
+        return CHUNK_LIMIT - self._size - undefined
+
+    def append(self, data: bytes, messages: Mapping[Channel, list[int]]) -> None:
+        """
+        Add encoded messages to the open chunk, in which there must be room for them.
+
+        :param messages: by channel time and offset in the data of each message, in turns.
+        """
+        for channel in messages:
+            if channel.undefined:
+                self._define(channel)
+        for channel, index in messages.items():
+            index[1::2] = [offset + self._size for offset in index[1::2]]
+            channel.index += index
+            channel.count += len(index) // 2
+            self.given += len(index) // 2
+        self._records.append(data)
+        self._size += len(data)
+
     def _extend_group(self, group: Group, entry: Sequence[Any], vpid: int) -> None:
         parts = group.parts
         self.given += len(parts) - 1
@@ -294,7 +330,7 @@ class TraceFile:
             reason = 'no such event' if isinstance(error, KeyError) else str(error)
             self.rejection = f'event {name!r} cannot be written ({reason})'
 
-    def _define(self, channel: _Channel) -> None:
+    def _define(self, channel: Channel) -> None:
         self._records += (channel.schema, channel.channel)
         self._size += channel.undefined
         channel.undefined = 0

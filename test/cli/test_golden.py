@@ -187,9 +187,7 @@ def files(folder, call):
     return folder
 
 
-@pytest.mark.parametrize('name', [
-    pytest.param(name, marks=[pytest.mark.needs('babeltrace2')] * (name == 'import_ctf'))
-    for name in COMMANDS])
+@pytest.mark.parametrize('name', COMMANDS)
 def test_output(name, files, call, monkeypatch):
     if name.startswith('check'):
         monkeypatch.setattr('mddag_executor.defaults.processors', lambda: 8)

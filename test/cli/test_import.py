@@ -16,7 +16,6 @@ def of_session(folder, name, made, host='robot', callback=1):
                          'hostname': host})
 
 
-@pytest.mark.needs('babeltrace2')
 def test_several_sessions_are_named_one_by_one(tmp_path, call):
     """Parts of one session are one recording, wherever they lie; two sessions need to be named."""
     out = tmp_path / 'out.mcap'
@@ -45,7 +44,6 @@ def test_several_sessions_are_named_one_by_one(tmp_path, call):
     assert done.stderr.endswith(': a session is named twice: name each once\n')
 
 
-@pytest.mark.needs('babeltrace2')
 def test_processes_of_several_containers_may_have_the_same_numbers(tmp_path, call):
     # in both containers process 1 runs a callback of the same address, at overlapping times
     kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
@@ -68,7 +66,6 @@ CALLBACK = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start
 BOOT = 'b5f5b5ae-2f0a-4d0c-8f6e-2a6a2f7a0001'
 
 
-@pytest.mark.needs('babeltrace2')
 @pytest.mark.parametrize('given', [('dual',), ('dual/runtime', 'dual/snapshot')])
 def test_both_sessions_of_a_dual_session_are_of_the_same_processes(given, tmp_path, call):
     """The first has the initialisation, the second what ran, and an event of a late node too."""
@@ -92,7 +89,6 @@ def test_both_sessions_of_a_dual_session_are_of_the_same_processes(given, tmp_pa
         ('rcl_node_init', 11)]
 
 
-@pytest.mark.needs('babeltrace2')
 def test_two_sessions_of_one_run_are_not_counted_twice(tmp_path, call):
     """The second began later and lost some events; the times differ a little."""
     events = [(n % 2, 10 * n, 5, 6, 'node', 7) for n in range(20)]
@@ -108,7 +104,6 @@ def test_two_sessions_of_one_run_are_not_counted_twice(tmp_path, call):
     assert [event['_timestamp'] % 1000 // 10 for event in read_events(out)] == list(range(20))
 
 
-@pytest.mark.needs('babeltrace2')
 @pytest.mark.parametrize('boot', [BOOT, BOOT.replace('1', '2')])
 def test_containers_of_one_host_may_have_equal_process_names(boot, tmp_path, call):
     """What the sessions have of one thread is not the same, so it is not one thread."""

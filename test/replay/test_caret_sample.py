@@ -19,9 +19,7 @@ from .flows import flows, slow_cases
 BESIDE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
 CARET = Path(os.environ.get('MDDAG_CARET_SAMPLE', BESIDE))
 SESSION = CARET / 'end_to_end_sample'
-pytestmark = [
-    pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there'),
-    pytest.mark.needs('babeltrace2')]
+pytestmark = pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there')
 
 GRAPH = """\
 mddag: 1

@@ -279,7 +279,6 @@ def test_damaged_bags(tmp_path, storage, compression):
             assert bag.warnings or found == whole
 
 
-@pytest.mark.needs('babeltrace2')
 def test_damaged_ctf_sessions(tmp_path):
     kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
     folder = session(tmp_path / 'session', kinds, [
