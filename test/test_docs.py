@@ -3,6 +3,8 @@
 """What README and documentation show works, and the documentation builds, offline."""
 
 import contextlib
+import importlib
+import inspect
 import io
 import json
 import os
@@ -117,6 +119,47 @@ def test_pages_of_reference_are_complete(tmp_path):
     page = (TOP / 'docs' / 'json.md').read_text(encoding='utf-8')
     sink = next(iter(result['dags']['control']['sinks'].values()))
     assert not [key for key in (*result, *sink) if f'`{key}`' not in page]
+
+
+API = TOP / 'docs' / 'api.md'
+API_TABLE = re.compile(r'(?<=<!-- the table -->\n)(?:\|.*\n)*')
+
+
+def named(path):
+    """Return the object that a dotted name means."""
+    module, rest = path.split('.'), []
+    while True:
+        try:
+            found = importlib.import_module('.'.join(module))
+            break
+        except ImportError:
+            rest.insert(0, module.pop())
+    for name in rest:
+        found = getattr(found, name)
+    return found
+
+
+def api_table():
+    """Return the names of the page of the API with the first sentences of their texts."""
+    rows = []
+    for path, options in re.findall(r'^::: (\S+)\n((?:    .*\n)*)',
+                                    API.read_text(encoding='utf-8'), re.MULTILINE):
+        members = re.search(r'members: \[([^\]]*)\]', options)
+        for name in ['', *(members[1].split(', ') if members else ())]:
+            full = f'{path}.{name}'.rstrip('.')
+            text = (inspect.getdoc(named(full)) or '').partition('\n\n')[0].replace('``', '`')
+            rows.append(f'| `{full}` | {" ".join(text.split())} |')
+    return '\n'.join(('| name | what it is |', '| --- | --- |', *rows)) + '\n'
+
+
+def test_the_page_of_the_api_lists_its_names():
+    """With UPDATE_GOLDEN in the environment, write the table: readers of a checkout see it."""
+    pytest.importorskip('rclpy')
+    text = API.read_text(encoding='utf-8')
+    if os.environ.get('UPDATE_GOLDEN'):
+        text = API_TABLE.sub(lambda match: api_table(), text, count=1)
+        API.write_text(text, encoding='utf-8')
+    assert API_TABLE.search(text)[0] == api_table(), 'run it with UPDATE_GOLDEN=1'
 
 
 # --- the site ------------------------------------------------------------------------------------
