@@ -10,70 +10,93 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mddag_executor.core.queues import is_stale
+from mddag_executor.core.queues import first_of
 from mddag_executor.core.state import (
+    ALONE,
     FREE,
+    HELD_BACK,
     N_HOLDING,
     N_IDLE,
-    N_STALE,
     OPEN,
     QueueEntry,
+    READY,
     RUNNING,
     State,
     SUSPENDED,
+    UNPOLLED,
     WAITING,
 )
-from mddag_executor.core.tables import Tables
+from mddag_executor.core.tables import NEVER, Tables
 
-ACTIVE = (WAITING, RUNNING, SUSPENDED)
+ACTIVE = (WAITING, ALONE, RUNNING, SUSPENDED)
 
 
 def broken_invariants(t: Tables, s: State) -> Iterator[str]:
     """Yield a sentence for each invariant that does not hold."""
-    yield from _queues(s)
+    yield from _heaps(s)
+    yield from _queues(t, s)
     yield from _workers(s)
     yield from _groups(t, s)
     yield from _slots(t, s)
     yield from _open_jobs(t, s)
 
 
-def _all_queues(s: State) -> Iterator[tuple[str, list[QueueEntry]]]:
-    yield 'the ready queue', s.ready
-    yield 'what is held back', s.held_back
+def _all_heaps(s: State) -> Iterator[tuple[str, int, list[QueueEntry]]]:
+    yield 'the ready heap', READY, s.ready
+    yield 'what is held back', HELD_BACK, s.held_back
+    yield 'what waits for a poll', UNPOLLED, s.unpolled
     for group, heap in enumerate(s.group_heap):
-        if heap:
-            yield f'the heap of group {group}', heap
-    for entity, queue in enumerate(s.entity_queue):
-        if queue:
-            yield f'the queue of entity {entity}', queue
+        yield f'the heap of group {group}', group, heap
 
 
-def _queues(s: State) -> Iterator[str]:
-    stale = 0
+def _heaps(s: State) -> Iterator[str]:
+    """Check that each entry is the one of its queue or execution, where that says."""
     found: set[int] = set()
-    for name, queue in _all_queues(s):
-        for place, entry in enumerate(queue):
-            if place > 0 and queue[(place - 1) // 2] > entry:
+    for name, at, heap in _all_heaps(s):
+        for place, entry in enumerate(heap):
+            what = entry[4]
+            if at != UNPOLLED and place > 0 and heap[(place - 1) // 2] > entry:
                 yield f'{name} is not a heap at its place {place}'
-            x = entry[4]
-            if is_stale(s, entry) or x in found:  # of two equal entries, one is stale
-                stale += 1
-            else:
-                found.add(x)
-    for number, rest in enumerate(s.queue_rest):
-        first = s.queue_first[number]
-        for order, _, _, _, x in rest:
-            if s.x_queue[x] != number or s.x_key[x][3] != order or first < 0:
-                yield f'execution {x} waits in queue {number}, the first of which is {first}'
-            found.add(x)
-    if stale != s.scalars[N_STALE]:
-        yield f'{stale} entries of queues are stale, counted are {s.scalars[N_STALE]}'
+            if what in found:
+                yield f'{name} has a second entry of {what}'
+            found.add(what)
+            if what < 0 and (s.x_state[~what] != ALONE or s.x_key[~what] != entry):
+                yield f'{name} has {entry} of execution {~what}: its state is {s.x_state[~what]}'
+            elif what >= 0 and (entry != s.queue_key[what] or s.queue_place[what] != at):
+                yield f'{name} has {entry} of queue {what}, which says {s.queue_key[what]} and ' \
+                      f'place {s.queue_place[what]}'
+    lost = [x for x, state in enumerate(s.x_state) if state == ALONE and ~x not in found]
+    if lost:
+        yield f'the executions {lost} wait alone, and are in no heap'
+    full = {queue for queue, first in enumerate(s.queue_first) if first >= 0}
+    if {what for what in found if what >= 0} != full:
+        yield f'the queues {sorted(full)} are not empty, those in a heap are ' \
+              f'{sorted(what for what in found if what >= 0)}'
+
+
+def _queues(t: Tables, s: State) -> Iterator[str]:
+    """Check the order in each queue, and that its key is the smallest unless it is late."""
+    found: set[int] = set()
+    for queue, first in enumerate(s.queue_first):
+        waiting = _chain(s.x_next, first, len(s.x_state))
+        back = _chain(s.x_previous, s.queue_last[queue], len(s.x_state))
+        if waiting != back[::-1] or len({*waiting}) != len(waiting):
+            yield f'queue {queue} is {waiting}, backwards {back}'
+        for before, after in zip(waiting, waiting[1:]):
+            if s.x_key[before] > s.x_key[after]:
+                yield f'execution {before} is before {after} in queue {queue}'
+        for x in waiting:
+            if s.x_state[x] != WAITING or s.x_queue[x] != queue or s.x_started[x] >= 0:
+                yield f'execution {x} in queue {queue} has state {s.x_state[x]}'
+        found.update(waiting)
+        if waiting and s.queue_key[queue] > s.x_key[first] and s.queue_demoted[queue] < 0 and (
+                s.x_vertex[first] == t.n_vertices or s.start_by[s.x_vertex[first]] == NEVER):
+            yield f'queue {queue} is not late, and comes after its first execution'
+        if not waiting and (s.queue_demoted[queue] >= 0 or s.queue_place[queue] != READY):
+            yield f'queue {queue} is empty, and is late or set aside'
     if len(found) != s.x_state.count(WAITING):
         lost = [x for x, state in enumerate(s.x_state) if state == WAITING and x not in found]
         yield f'the waiting executions {lost} are in no queue'
-    to_poll = [entity for entity, queue in enumerate(s.entity_queue) if queue]
-    if sorted(s.unpolled) != to_poll:
-        yield f'the entities {to_poll} wait for a poll, noted are {sorted(s.unpolled)}'
 
 
 def _workers(s: State) -> Iterator[str]:
@@ -99,10 +122,9 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
         if owner >= 0 and (s.x_group[owner] != group or s.x_state[owner] not in ACTIVE):
             yield (f'group {group} is owned by execution {owner}, which has group '
                    f'{s.x_group[owner]} and state {s.x_state[owner]}')
-    coming = {s.x_group[entry[4]] for entry in (*s.ready, *s.held_back)
-              if not is_stale(s, entry)}
+    coming = {s.x_group[first_of(s, entry)] for entry in (*s.ready, *s.held_back)}
     for group, heap in enumerate(s.group_heap):
-        waiting = [entry[4] for entry in heap if not is_stale(s, entry)]
+        waiting = [first_of(s, entry) for entry in heap]
         if waiting and s.group_owner[group] < 0 and group not in coming:
             yield f'group {group} is free, and nothing brings its executions {waiting} forward'
         for x in waiting:
@@ -128,7 +150,7 @@ def _slots(t: Tables, s: State) -> Iterator[str]:
                 continue
             active += 1
             group = s.x_group[x]
-            if state != WAITING and group >= 0 and s.group_owner[group] != x:
+            if state in (RUNNING, SUSPENDED) and group >= 0 and s.group_owner[group] != x:
                 yield (f'execution {x} runs or is suspended, and its group {group} is owned by '
                        f'{s.group_owner[group]}')
         if active != s.job_active[slot]:

@@ -60,10 +60,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     s.job_state[slot] = OPEN
     s.job_sinks_left[slot] = t.first_sink[dag + 1] - t.first_sink[dag]
     s.job_late[slot] = 0
-    s.job_hope[slot] = NEVER
-    if demotes(t, s, dag):
-        s.job_hope[slot] = release
-        s.job_demoted[slot] = -1
+    s.job_demoted[slot] = -1
     s.job_active[slot] = 0
     _link_newest(s, dag, slot)
     base = s.job_base[slot]

@@ -1,33 +1,32 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Demoted jobs: rules 7 and 14 of the scheduling rules, which ``rules`` lists.
+Late queues and importance: rules 7 and 14 of the scheduling rules, which ``rules`` lists.
 
-An execution is checked (``demote``) when it comes first in a queue after ``State.start_by`` of its
-vertex.  That is the latest start with which all its sinks are in time; or the past if every
-execution of the vertex must be checked, because an older one is demoted or the vertex gives way to
-more important ones.  So work that is in time costs one comparison.  Like ``rules`` this module
-contains only integer arithmetic, list indexing and ``heapq``.
+What comes first is checked (``demote``) after ``State.start_by`` of its vertex.  That is the
+latest start with which all its sinks are in time, or the past if the vertex gives way to more
+important ones.  So work that is in time costs one comparison.  Like ``rules`` this module contains
+only integer arithmetic, list indexing and ``heapq``.
 
 docs/run.md names the sources.
 """
 
 from __future__ import annotations
 
-from heapq import heappop, heappush
+from heapq import heappop
 
 from mddag_executor.core.jobs import demotes, judge
-from mddag_executor.core.queues import add_stale
+from mddag_executor.core.queues import change_key, come_forward
 from mddag_executor.core.state import (
+    ALONE,
     DEADLINE_KEYS,
     ELSEWHERE,
     OPEN,
-    OTHER_KEYS,
+    QueueEntry,
     SINK_DEMOTED,
     START_KEYS,
     State,
     URGENCY,
-    WAITING,
 )
 from mddag_executor.core.tables import IMPORTANT, NEVER, Tables
 
@@ -41,165 +40,143 @@ Less important work gives way to a late sink for as many of the sink's relative 
 PPM = 1_000_000
 
 
-def demote(t: Tables, s: State, x: int, now: int) -> bool:
+def demote(t: Tables, s: State, heap: list[QueueEntry], x: int, now: int) -> bool:
     """
-    Change the key of the execution that comes first in a queue, or of an older one (rules 7, 14).
+    Check what comes first in a heap, with its execution, which may be late (rule 7).
 
-    :return: whether a key changed; the old entry is then stale.
+    :return: whether it has a larger key now, with which it is in the ready heap.
     """
-    key = s.x_key[x]
-    vertex = s.x_vertex[x]
-    if vertex == t.n_vertices:
-        return demote_undeclared(t, s, x, now)
-    demoted = s.demoted[vertex]
-    while demoted and (s.x_state[demoted[0][4]] != WAITING
-                       or s.x_key[demoted[0][4]][3] != demoted[0][0]):
-        heappop(demoted)  # it has started or was dropped
-        if len(demoted) == 0:
-            set_start(t, s, vertex)
-    if s.urged[vertex] == key[3]:
-        return False  # it has the key of another one
-    fresh = s.x_started[x] < 0
-    first = -1
-    if fresh and demoted and demoted[0][0] < key[3]:
-        first = demoted[0][4]
-    priority = late_priority(t, s, x, first, now)
-    if priority > key[0]:
-        if fresh:
-            heappush(demoted, (key[3], 0, 0, 0, x))
-            s.start_by[vertex] = -NEVER
-        _change_key(s, x, priority)
-        return True
-    if first < 0 or s.x_key[first][0] <= key[0]:
+    entry = heap[0]
+    priority = NEVER
+    if entry[4] >= 0 or s.x_vertex[x] < t.n_vertices or s.x_started[x] < 0:
+        priority = _priority_in_time(t, s, x, now)
+        if priority == NEVER:
+            priority = _late_priority(t, s, x, now)
+    if priority == NEVER or priority <= entry[0]:
         return False
-    s.urged[vertex] = s.x_key[first][3]
-    _change_key(s, first, key[0])
+    heappop(heap)
+    entry = (priority, entry[1], entry[2], entry[3], entry[4])
+    if entry[4] >= 0:
+        s.queue_key[entry[4]] = entry
+    else:
+        s.x_key[x] = entry
+    come_forward(s, entry)
     return True
 
 
-def demote_undeclared(t: Tables, s: State, x: int, now: int) -> bool:
-    """Demote the first undeclared execution of a queue, once; return whether its key changed."""
+def _priority_in_time(t: Tables, s: State, x: int, now: int) -> int:
+    """
+    Return the priority of the first execution, from one on in its queue, that can be in time.
+
+    NEVER: there is none.  In an overload the mean execution times of those before it count.  Sinks
+    at which the given one is late are noted.
+    """
+    vertex = s.x_vertex[x]
+    if vertex == t.n_vertices:
+        return NEVER  # it is not known how long they take
+    process = _process(t, s, vertex)
+    yields = _still_gives_way(t, s, vertex, now)
+    begin = now
+    if s.x_started[x] >= 0:  # it was preempted
+        begin -= max(0, s.x_cost[x] - s.x_left[x])  # less than 0: overheads
+    each = x
+    while each >= 0:
+        slot = s.x_slot[each]
+        release = s.job_release[slot]
+        deadline = NEVER
+        start = NEVER
+        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+            if yields or begin > release + s.reach_by[i]:
+                if each == x:
+                    note_late(t, s, t.reach_sink[i], now)
+                    _announce_demoted(t, s, slot, t.reach_sink[i], now)
+            else:
+                deadline = min(deadline, t.reach_deadline[i])
+                start = min(start, t.reach_start[i])
+        if deadline < NEVER:
+            return _priority(t, s, vertex, release, deadline, start)
+        if s.overloaded[process] != 0:
+            begin += s.mean[vertex]
+        each = s.x_next[each]
+    return NEVER
+
+
+def _late_priority(t: Tables, s: State, x: int, now: int) -> int:
+    """Return the priority of a late queue, or late execution that waits alone."""
     slot, vertex, queue = s.x_slot[x], s.x_vertex[x], s.x_queue[x]
-    if s.x_started[x] >= 0 or s.job_demoted[slot] >= 0:
-        return False
-    s.job_demoted[slot] = now + LATE_PATIENCE * t.rad_offset[vertex]
+    if s.x_state[x] == ALONE:
+        queue = -1
+    release = s.job_demoted[slot]
+    if queue >= 0 and s.queue_demoted[queue] >= 0 and (
+            release < 0 or s.queue_demoted[queue] < release):
+        release = s.queue_demoted[queue]
+    if release < 0:
+        release = now + LATE_PATIENCE * t.dag_deadline[t.dag_of[vertex]]
+    if s.job_demoted[slot] < 0:
+        s.job_demoted[slot] = release
     if queue >= 0:
-        s.queue_late[queue] = 1
-    priority = _priority(
-        t, s, x, s.job_demoted[slot], t.rad_offset[vertex], t.latest_start[vertex])
-    if priority > s.x_key[x][0]:
-        _change_key(s, x, priority)
-        return True
-    return False
+        s.queue_demoted[queue] = release
+    return _priority(t, s, vertex, release, t.rad_offset[vertex], t.latest_start[vertex])
 
 
-def _change_key(s: State, x: int, priority: int) -> None:
-    key = s.x_key[x]
-    s.x_key[x] = (priority, key[1], key[2], key[3], x)
-    heappush(s.ready, s.x_key[x])
-    add_stale(s)
-
-
-def _priority(t: Tables, s: State, x: int, release: int, deadline: int, start: int) -> int:
+def _priority(t: Tables, s: State, vertex: int, release: int, deadline: int, start: int) -> int:
     """Return the priority by a policy whose keys are times."""
     if s.scalars[URGENCY] == DEADLINE_KEYS:
         return release + deadline
     if s.scalars[URGENCY] == START_KEYS:
         return release + start
-    return release + t.dag_deadline[s.job_dag[s.x_slot[x]]]
+    return release + t.dag_deadline[t.dag_of[vertex]]
 
 
-def late_priority(t: Tables, s: State, x: int, first: int, now: int) -> int:
-    """
-    Return the priority of an execution by the sinks that can be in time; if none, demote its job.
-
-    :param first: the oldest demoted execution of its vertex if that is older, or -1.
-    """
-    slot = s.x_slot[x]
-    vertex = s.x_vertex[x]
-    process = _process(t, s, vertex)
-    begin = now
-    if first >= 0 and s.overloaded[process] != 0:
-        begin += len(s.demoted[vertex]) * s.mean[vertex]
-    elif s.x_started[x] >= 0:  # it was preempted
-        begin -= max(0, s.x_cost[x] - s.x_left[x])  # less than 0: overheads
-    yields = _still_gives_way(t, s, vertex, now)
-    deadline = NEVER
-    start = NEVER
-    for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
-        sink = t.reach_sink[i]
-        if yields or begin > s.job_hope[slot] + s.reach_by[i]:
-            note_late(t, s, slot, sink, now)
-            _announce_demoted(t, s, slot, sink, now)
-        else:
-            deadline = min(deadline, t.reach_deadline[i])
-            start = min(start, t.reach_start[i])
-    if deadline < NEVER:
-        release = s.job_release[slot]
-        if 0 <= s.waits_since[vertex] < release:
-            release = s.waits_since[vertex]
-        return _priority(t, s, x, release, deadline, start)
-    if first >= 0:
-        return s.x_key[first][0]
-    if s.job_demoted[slot] < 0:
-        s.job_demoted[slot] = now + LATE_PATIENCE * t.dag_deadline[s.job_dag[slot]]
-        if s.passed_on[vertex] >= 0:
-            s.job_demoted[slot] = s.passed_on[vertex]
-            s.passed_on[vertex] = -1
-    return _priority(
-        t, s, x, s.job_demoted[slot], t.rad_offset[vertex], t.latest_start[vertex])
+def next_entry(t: Tables, s: State, queue: int, now: int) -> QueueEntry:
+    """Return the entry of a queue whose first execution starts now, for the next one."""
+    after = s.queue_first[queue]
+    entry = s.x_key[after]
+    if s.queue_demoted[queue] >= 0:
+        s.queue_demoted[queue] = -1
+        if s.x_vertex[after] == t.n_vertices:  # it remains late until it is empty
+            entry = (_late_priority(t, s, after, now), entry[1], entry[2], entry[3], queue)
+    return entry
 
 
 def is_late(t: Tables, s: State, x: int, now: int) -> bool:
-    """Return whether an execution that starts now can be in time at no sink (rule 7)."""
+    """Return whether a waiting execution that starts now can be in time at no sink (rule 7)."""
     vertex = s.x_vertex[x]
-    for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
-        if now <= s.job_hope[s.x_slot[x]] + s.reach_by[i]:
-            return False
-    return vertex < t.n_vertices
+    release = s.job_release[s.x_slot[x]]
+    if now <= release + s.start_by[vertex]:
+        return False
+    if not _still_gives_way(t, s, vertex, now):
+        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+            if now <= release + s.reach_by[i]:
+                return False
+    return True
 
 
-def pass_on_age(t: Tables, s: State, x: int, now: int) -> None:
-    """Let the next execution of a vertex go as early as this one, which is about to be dropped."""
-    slot, vertex = s.x_slot[x], s.x_vertex[x]
-    if vertex == t.n_vertices or s.scalars[URGENCY] == OTHER_KEYS:
-        return
-    if s.job_hope[slot] < NEVER and s.job_demoted[slot] < 0 and s.job_state[slot] == OPEN:
-        late_priority(t, s, x, -1, now)  # demotes its job if that is late
-    since = s.job_demoted[slot]
-    if s.job_hope[slot] < NEVER and since >= 0:
-        if s.passed_on[vertex] < 0 or since < s.passed_on[vertex]:
-            s.passed_on[vertex] = since
-    elif s.waits_since[vertex] < 0 or s.job_release[slot] < s.waits_since[vertex]:
-        s.waits_since[vertex] = s.job_release[slot]
+def announce_late(t: Tables, s: State, x: int, now: int) -> None:
+    """Note that an execution, which is to be dropped, is late at all of its sinks."""
+    for i in range(t.first_reach[s.x_vertex[x]], t.first_reach[s.x_vertex[x] + 1]):
+        note_late(t, s, t.reach_sink[i], now)
+        _announce_demoted(t, s, s.x_slot[x], t.reach_sink[i], now)
 
 
-def inherit_age(t: Tables, s: State, x: int) -> None:
-    """Let the first waiting execution of a vertex go as early as those dropped before it."""
-    vertex = s.x_vertex[x]
-    demoted, waits = s.passed_on[vertex], s.waits_since[vertex]
-    if demoted < 0 and waits < 0 or s.x_state[x] != WAITING or s.x_started[x] >= 0:
-        return
-    offset, start = t.rad_offset[vertex], t.latest_start[vertex]
-    if demoted >= 0:
-        priority = _priority(t, s, x, demoted, offset, start)
-        if priority < s.x_key[x][0]:
-            s.urged[vertex] = s.x_key[x][3]
-            _change_key(s, x, priority)
-    if waits >= 0 and not gives_way(t, s, vertex):
-        priority = _priority(t, s, x, waits, offset, start)
-        if priority < s.x_key[x][0]:
-            _change_key(s, x, priority)
+def drop_late(t: Tables, s: State, x: int, now: int) -> None:
+    """Demote the queue of an execution that is late, and was just dropped from it."""
+    queue = s.x_queue[x]
+    priority = _late_priority(t, s, x, now)
+    key = s.x_key[s.queue_first[queue]]
+    if s.x_vertex[x] == t.n_vertices or priority < key[0]:
+        key = (priority, key[1], key[2], key[3], queue)
+    change_key(s, queue, key)
 
 
 def set_start(t: Tables, s: State, vertex: int) -> None:
     """Set from when on an execution of a vertex that comes first is checked."""
-    if s.demoted[vertex] or gives_way(t, s, vertex):
-        s.start_by[vertex] = -NEVER
-        return
     s.start_by[vertex] = NEVER
-    for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
-        s.start_by[vertex] = min(s.start_by[vertex], s.reach_by[i])
+    if gives_way(t, s, vertex):
+        s.start_by[vertex] = -NEVER
+    elif demotes(t, s, t.dag_of[vertex]):
+        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+            s.start_by[vertex] = min(s.start_by[vertex], s.reach_by[i])
 
 
 # --- importance ----------------------------------------------------------------------------------
@@ -266,9 +243,9 @@ def _process(t: Tables, s: State, vertex: int) -> int:
     return 1 if len(s.pool) == 0 else t.process[vertex]
 
 
-def note_late(t: Tables, s: State, slot: int, sink: int, now: int) -> None:
+def note_late(t: Tables, s: State, sink: int, now: int) -> None:
     """Note that a sink is late: less important work gives way to it for a while (rule 14)."""
-    if s.job_hope[slot] == NEVER or gives_way(t, s, sink):
+    if not demotes(t, s, t.dag_of[sink]) or gives_way(t, s, sink):
         return  # late jobs of the DAG are not demoted, or it must itself give way
     process = _process(t, s, sink)
     if t.importance[sink] >= s.late_importance[process]:

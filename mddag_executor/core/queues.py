@@ -5,107 +5,193 @@ The queues in which executions wait: rules 3, 4, 9, 11 and 12 (see ``rules``).
 
 Theory of operation
 -------------------
-A waiting execution is in exactly one of
+Each callback has a *queue*: a vertex has one (with legs, each leg), and so has each undeclared
+callback of a live run.  Executions that have not started wait in it in the order of their keys: a
+list linked by ``State.x_next``, to which nearly all are appended.  Its first execution runs first.
+So messages of a callback keep their order, whatever happens to keys.  A queue that is not empty
+has exactly one *entry*, with the key of the queue (``State.queue_key``).  That is the smallest key
+of its executions, also of those that were dropped since the last one started, or the one by rule 7
+if it is late.  So age and place belong to the queue, and dropping an execution costs nothing.
 
-* the ready queue (``State.ready``), a heap by the keys of the policy;
-* the heap of its callback group (``State.group_heap``), if the group was busy when it came first;
-* the heap of deferred executions (``State.held_back``), if an execution as urgent held the
+An execution that has begun (it was preempted or refused, or goes on after it has waited) waits
+*alone*: it has an entry of its own, and does not stop those in the queue.  So does an undeclared
+one without a queue (simulation).
+
+Each entry is in exactly one of
+
+* the ready heap (``State.ready``), by the keys of the policy;
+* the heap of a callback group (``State.group_heap``), if the group was busy when it came first;
+* the heap of what is deferred (``State.held_back``), if an execution as urgent held the
 interpreter when it came first, or no worker of its process was idle;
-* under a policy that polls, the queue of its *entity* (``State.entity_queue``), as in the wait set
-of rclpy and rclcpp: a timer, or a subscription with its waiting messages.
+* under a policy that polls, the list of what waits for a poll (``State.unpolled``).
 
-A dropped execution leaves a *stale* entry, until the entry reaches the top or stale entries are
-the larger part of all.  So does one whose key changes (rule 7); if it gets an earlier key back, it
-has two equal entries, and one of them counts as stale.
+An entry whose key changes is replaced where it is, so no heap has an outdated one.  It nearly
+always is the first one; for any other the heap is searched, which is rare.
 
-**Polling rounds** (rule 9).  Between two polls the ready queue is the result of the last one;
-executions that become ready wait at their entity, in that order.  ``poll`` takes the first of
-every entity, so each entity runs at most once in a round.  Undeclared executions share one queue,
-in which every entry counts as a separate entity.
+**Polling rounds** (rule 9).  Between two polls the ready heap is the result of the last one; what
+becomes ready waits for the next one.  Of each *entity*, as in the wait set of rclpy and rclcpp (a
+timer, or a subscription with its waiting messages), ``poll`` takes the first execution, so each
+entity runs at most once in a round.  Vertices of one callback are one entity; undeclared queues
+and executions are an entity each.
 """
 
 from __future__ import annotations
 
-from heapq import heapify, heappop, heappush
+from heapq import heapify, heappush
 
 from mddag_executor.core.state import (
+    ALONE,
+    HELD_BACK,
     N_HOLDING,
-    N_STALE,
+    POLLING,
     QueueEntry,
+    READY,
     State,
+    UNPOLLED,
     WAITING,
 )
-from mddag_executor.core.tables import Tables
+from mddag_executor.core.tables import NEVER, Tables
 
 TURN_NS = 1_000_000
 """No overtaking if the holder needs less time than this: Python switches threads no sooner."""
 PATIENCE = 2
 """Overtaking pays if the wait for the interpreter, times this, reaches RAD minus release."""
-SWEEP_AT = 64
-"""How many stale entries are always allowed in the queues."""
 
 
-def is_stale(s: State, entry: QueueEntry) -> bool:
-    """Return whether an entry is of a dropped execution (whose id may be in use again)."""
-    return s.x_state[entry[4]] != WAITING or s.x_key[entry[4]] != entry
-
-
-def add_stale(s: State) -> None:
-    """Count one more stale entry; remove all when they are the larger part."""
-    s.scalars[N_STALE] += 1
-    if s.scalars[N_STALE] > SWEEP_AT:
-        _sweep(s)
-
-
-def _sweep(s: State) -> None:
-    """Remove stale entries from all queues when they are the larger part: memory is bounded."""
-    length = len(s.ready) + len(s.held_back)
-    for group in range(len(s.group_heap)):
-        length += len(s.group_heap[group])
-    for entity in range(len(s.entity_queue)):
-        length += len(s.entity_queue[entity])
-    if 2 * s.scalars[N_STALE] <= length:
+def enqueue(t: Tables, s: State, x: int) -> None:
+    """Let a fresh execution wait in the queue of its callback, in the order of its key."""
+    queue = s.x_queue[x]
+    entry = s.x_key[x]
+    s.x_started[x] = -1
+    s.x_state[x] = WAITING
+    before = s.queue_last[queue]
+    if before < 0:
+        s.queue_first[queue] = s.queue_last[queue] = x
+        put(s, entry)
         return
-    seen = [False] * len(s.x_state)
-    _keep_valid(s, s.ready, seen)
-    _keep_valid(s, s.held_back, seen)
-    for group in range(len(s.group_heap)):
-        _keep_valid(s, s.group_heap[group], seen)
-    for entity in range(len(s.entity_queue)):
-        _keep_valid(s, s.entity_queue[entity], seen)
-    kept = 0
-    for i in range(len(s.unpolled)):
-        if len(s.entity_queue[s.unpolled[i]]) > 0:
-            s.unpolled[kept] = s.unpolled[i]
-            kept += 1
-    del s.unpolled[kept:]
-    s.scalars[N_STALE] = 0
+    after = -1
+    while before >= 0 and entry < s.x_key[before]:
+        after = before
+        before = s.x_previous[before]
+    _link(s, queue, before, x)
+    _link(s, queue, x, after)
+    # while an undeclared queue is late, no execution in it counts as in time (rule 7)
+    if entry < s.queue_key[queue] and (
+            s.queue_demoted[queue] < 0 or s.x_vertex[x] < t.n_vertices):
+        change_key(s, queue, entry)
 
 
-def _keep_valid(s: State, heap: list[QueueEntry], seen: list[bool]) -> None:
-    """Keep the entries that are not stale, of two equal ones the first."""
-    kept = 0
+def wait_alone(s: State, x: int) -> None:
+    """Let an execution wait with an entry of its own, not in a queue."""
+    key = s.x_key[x]
+    s.x_key[x] = (key[0], key[1], key[2], key[3], ~x)
+    s.x_state[x] = ALONE
+    heappush(s.ready, s.x_key[x])
+
+
+def _link(s: State, queue: int, before: int, after: int) -> None:
+    """Let an execution follow another one in a queue; -1: there is none."""
+    if before < 0:
+        s.queue_first[queue] = after
+    else:
+        s.x_next[before] = after
+    if after < 0:
+        s.queue_last[queue] = before
+    else:
+        s.x_previous[after] = before
+
+
+def put(s: State, entry: QueueEntry) -> None:
+    """Add the entry of a queue that had none."""
+    queue = entry[4]
+    s.queue_key[queue] = entry
+    if s.scalars[POLLING] == 0:
+        heappush(s.ready, entry)
+    else:
+        wait_for_poll(s, entry)
+
+
+def unlink(s: State, x: int) -> None:
+    """Take a waiting execution out of its queue, or away with its entry."""
+    if s.x_state[x] == ALONE:
+        _remove(s.ready, ~x)
+        _remove(s.held_back, ~x)
+        _remove(s.unpolled, ~x)
+        if s.x_group[x] >= 0:
+            _remove(s.group_heap[s.x_group[x]], ~x)
+        return
+    queue = s.x_queue[x]
+    is_first = s.queue_first[queue] == x
+    _link(s, queue, s.x_previous[x], s.x_next[x])
+    s.x_next[x] = s.x_previous[x] = -1
+    if s.queue_first[queue] < 0:
+        _remove(heap_at(s, s.queue_place[queue]), queue)
+        s.queue_place[queue] = READY
+        s.queue_demoted[queue] = -1
+    elif is_first and s.queue_place[queue] != READY and s.queue_place[queue] != UNPOLLED:
+        # the next one may be of another group, or not need the interpreter
+        change_key(s, queue, s.queue_key[queue])
+
+
+def heap_at(s: State, place: int) -> list[QueueEntry]:
+    """Return the heap, or the list of what waits for a poll, at a place."""
+    if place >= 0:
+        return s.group_heap[place]
+    if place == HELD_BACK:
+        return s.held_back
+    return s.unpolled if place == UNPOLLED else s.ready
+
+
+def change_key(s: State, queue: int, entry: QueueEntry) -> None:
+    """Replace the entry of a queue, and let it come forward: its first execution may be new."""
+    heap = heap_at(s, s.queue_place[queue])
+    s.queue_key[queue] = entry
+    if s.queue_place[queue] == READY or s.queue_place[queue] == UNPOLLED:
+        heap[_place_of(heap, queue)] = entry
+        heapify(heap)
+    else:
+        _remove(heap, queue)
+        come_forward(s, entry)
+
+
+def come_forward(s: State, entry: QueueEntry) -> None:
+    """Put an entry that was set aside into the ready heap."""
+    if entry[4] >= 0:
+        s.queue_place[entry[4]] = READY
+    heappush(s.ready, entry)
+
+
+def first_of(s: State, entry: QueueEntry) -> int:
+    """Return the execution that an entry stands for."""
+    return s.queue_first[entry[4]] if entry[4] >= 0 else ~entry[4]
+
+
+def _place_of(heap: list[QueueEntry], what: int) -> int:
+    """Return the index of the entry of a queue, or ``~x``, in a heap; -1: it is not there."""
     for i in range(len(heap)):
-        x = heap[i][4]
-        if not is_stale(s, heap[i]) and not seen[x]:
-            seen[x] = True
-            heap[kept] = heap[i]
-            kept += 1
-    del heap[kept:]
-    heapify(heap)
+        if heap[i][4] == what:
+            return i
+    return -1
 
 
-def next_queue(t: Tables, s: State, first: bool) -> list[QueueEntry]:
+def _remove(heap: list[QueueEntry], what: int) -> None:
+    """Remove the entry of a queue, or ``~x``, from a heap if it is there."""
+    place = _place_of(heap, what)
+    if place >= 0:
+        last = heap.pop()
+        if place < len(heap):
+            heap[place] = last
+            heapify(heap)
+
+
+def next_heap(t: Tables, s: State, first: bool) -> list[QueueEntry]:
     """
-    Return the queue whose first entry is dispatched first; empty if there is none.
+    Return the heap whose first entry is dispatched first; empty if there is none.
 
-    Deferred executions count once they may start (rules 11 and 12).
+    What is deferred counts once it may start (rules 11 and 12).
 
-    :param first: no execution has been set aside since a resource became free.
+    :param first: nothing has been set aside since a resource became free.
     """
-    if s.scalars[N_STALE] > 0:
-        _drop_stale(s, s.ready)
-        _drop_stale(s, s.held_back)
     if len(s.overtaking) > 2:
         if first:
             _bring_forward(t, s)
@@ -116,23 +202,17 @@ def next_queue(t: Tables, s: State, first: bool) -> list[QueueEntry]:
 
 
 def _bring_forward(t: Tables, s: State) -> None:
-    """Move deferred executions that may start now into the ready queue."""
+    """Move what is deferred, and may start now, into the ready heap."""
     kept = 0
     for i in range(len(s.held_back)):
         entry = s.held_back[i]
-        if not is_stale(s, entry) and may_start(t, s, entry):
-            heappush(s.ready, entry)
+        if may_start(t, s, entry):
+            come_forward(s, entry)
         else:
             s.held_back[kept] = entry
             kept += 1
     del s.held_back[kept:]
     heapify(s.held_back)
-
-
-def _drop_stale(s: State, queue: list[QueueEntry]) -> None:
-    while queue and is_stale(s, queue[0]):
-        heappop(queue)
-        s.scalars[N_STALE] -= 1
 
 
 def idle_worker(t: Tables, s: State, x: int) -> int:
@@ -146,30 +226,32 @@ def idle_worker(t: Tables, s: State, x: int) -> int:
 
 def may_start(t: Tables, s: State, entry: QueueEntry) -> bool:
     """
-    Return whether a waiting execution may start.
+    Return whether what waits with an entry may start.
 
     Its process must have an idle worker (rule 12), and no execution that is as urgent or more may
     hold the interpreter that it needs (rule 11).
     """
-    interpreter = s.x_holds[entry[4]]
+    interpreter = s.x_holds[first_of(s, entry)]
     if interpreter != 0 and s.scalars[N_HOLDING] > 0:
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
             if (x >= 0 and s.x_holds[x] == interpreter
                     and (s.overtaking[interpreter] == 0 or s.x_key[x][0] <= entry[0])):
                 return False
-    return len(s.pool) == 0 or idle_worker(t, s, entry[4]) >= 0
+    return len(s.pool) == 0 or idle_worker(t, s, first_of(s, entry)) >= 0
 
 
 def first_waiting(t: Tables, s: State, process: int) -> int:
     """Return the first waiting execution of all, or of one process if there are several."""
     first = -1
-    for queue in (s.ready, s.held_back):
-        for i in range(len(queue) if len(s.overtaking) > 2 else min(1, len(queue))):
-            x = queue[i][4]
-            if ((len(s.overtaking) == 2 or t.process[s.x_vertex[x]] == process)
-                    and (first < 0 or queue[i] < s.x_key[first])):
-                first = x
+    smallest = (NEVER, 0, 0, 0, 0)
+    for heap in (s.ready, s.held_back):
+        for i in range(len(heap) if len(s.overtaking) > 2 else min(1, len(heap))):
+            if heap[i] < smallest:
+                x = first_of(s, heap[i])
+                if len(s.overtaking) == 2 or t.process[s.x_vertex[x]] == process:
+                    first = x
+                    smallest = heap[i]
     return first
 
 
@@ -203,35 +285,36 @@ def overtaking_pays_from(
     return usual + max(TURN_NS, wait)
 
 
-def wait_for_poll(t: Tables, s: State, entry: QueueEntry) -> None:
-    """Queue an execution at its entity until a poll (rule 9)."""
-    x = entry[4]
-    vertex = s.x_vertex[x]
-    entity = t.entity[vertex]
-    if vertex < t.n_vertices:  # each topic of a sync is a separate subscription
-        leg = x - s.job_base[s.x_slot[x]] - t.region_offset[vertex]
-        entity += t.leg_topic[t.first_leg[vertex] + leg]
-    queue = s.entity_queue[entity]
-    if len(queue) == 0:
-        s.unpolled.append(entity)
-    heappush(queue, entry)
+def wait_for_poll(s: State, entry: QueueEntry) -> None:
+    """Let an entry wait for the next poll (rule 9)."""
+    if entry[4] >= 0:
+        s.queue_place[entry[4]] = UNPOLLED
+    s.unpolled.append(entry)
 
 
 def poll(t: Tables, s: State) -> None:
-    """Begin a round: move the first of every entity to the ready queue, which is empty."""
+    """Begin a round: move the first of every entity to the ready heap, which is empty."""
+    for i in range(len(s.unpolled)):
+        entity = _entity(t, s.unpolled[i])
+        if entity >= 0:
+            s.first_order[entity] = min(s.first_order[entity], s.unpolled[i][1])
     kept = 0
     for i in range(len(s.unpolled)):
-        entity = s.unpolled[i]
-        queue = s.entity_queue[entity]
-        waits = True
-        while queue and waits:
-            entry = heappop(queue)
-            if is_stale(s, entry):
-                s.scalars[N_STALE] -= 1
-            else:
-                heappush(s.ready, entry)
-                waits = entity == t.n_entities
-        if queue:
-            s.unpolled[kept] = entity
+        entry = s.unpolled[i]
+        entity = _entity(t, entry)
+        if entity < 0 or entry[1] == s.first_order[entity]:
+            come_forward(s, entry)
+        else:
+            s.unpolled[kept] = entry
             kept += 1
     del s.unpolled[kept:]
+    for entity in range(len(s.first_order)):
+        s.first_order[entity] = NEVER
+
+
+def _entity(t: Tables, entry: QueueEntry) -> int:
+    """Return the entity of what waits for a poll, -1: its own; each topic of a sync is one."""
+    queue = entry[4]
+    if queue < 0 or queue >= len(t.leg_topic):
+        return -1
+    return entry[0] + t.leg_topic[queue]

@@ -18,18 +18,20 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     vertices (OR).  If sync callbacks run leg by leg (live), a leg is the message of one
     predecessor and ready when that arrives.  The countdown happens at the leg's completion; the
     last leg completes the vertex.
-3.  **Order.**  Ready executions wait in a heap by the key of the policy, smallest first.  Ties go
-    by the *order*, a running number given when an execution becomes ready or is put back.  At one
-    instant, as in the paper's own program, completions come first, by worker, and of each its
-    successors in reverse order of its edges; then releases, by DAG; then, during dispatch,
-    preempted executions.  An execution that goes on after it has waited (*resumes*) becomes ready
-    again: it keeps the key of its job, but an undeclared one counts from then on.
+3.  **Order.**  Each callback has a queue, in which its ready executions wait in the order of the
+    policy's keys, smallest first (``queues``); the first one runs first.  The queues wait in a
+    heap, each with its smallest key.  Ties go by the *order*, a running number given when an
+    execution becomes ready or is put back.  At one instant, as in the paper's own program,
+    completions come first, by worker, and of each its successors in reverse order of its edges;
+    then releases, by DAG; then, during dispatch, preempted executions.  An execution that goes on
+    after it was preempted or has waited (*resumes*) waits alone: it keeps the key of its job, but
+    an undeclared one counts from then on.
 4.  **Callback groups.**  A group has at most one owner, from its first dispatch to its completion
-    (also while preempted or suspended).  An execution that comes first while its group is busy is
-    set aside in the group's heap; when the owner completes, the group's smallest returns.  A
-    user-defined group lets executions run one by one: if the owner may begin, it leaves the group
-    for good (``leave_group``); if not, it waits as the owner, so that no other one overtakes it
-    (``refuse``, then ``ask_again``).
+    (also while preempted or suspended).  A queue that comes first while the group of its first
+    execution is busy is set aside in the group's heap; when the owner completes, the group's
+    smallest returns.  A user-defined group lets executions run one by one: if the owner may begin,
+    it leaves the group for good (``leave_group``); if not, it waits as the owner, so that no other
+    one overtakes it (``refuse``, then ``ask_again``).
 5.  **Workers.**  A fresh execution goes to the idle worker with the lowest number (``schedule``),
     or to the worker that asks (``take``: live, cache-warm).  If no worker is idle and preemption
     is on, the running execution with the largest priority (ties: the highest worker number) is put
@@ -42,32 +44,31 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     its verdict, which is then not in time.  Jobs released less than ``SKIP`` after the first one
     (warm-up), before ``JUDGE_FROM``, or not before ``JUDGE_UNTIL``, get no verdicts; live,
     ``judge_from`` is called when all programs have started.
-7.  **Late jobs.** ``CONTINUE`` lets a late job go on as before.  ``DEMOTE`` lowers the priority of
-    an execution that comes first in a queue, if none of its sinks can be in time: the time plus
-    the mean execution times on the longest path to the sink is past its deadline.  From then on
-    its job counts as released ``LATE_PATIENCE`` relative deadlines later.  So demoted jobs age,
-    and each callback gets some time.  An execution with sinks of both kinds has as RAD the
-    earliest deadline of those that can be in time.  Executions of one vertex keep their order: one
-    that comes first while older ones are demoted has to wait for these.  If it can be in time, the
-    oldest inherits its priority, so a backlog is worked off; if not, it is demoted behind the
-    oldest.  Age is a property of the queue: if an execution is dropped (rule 13, or live a full
-    queue), the next one of its vertex counts as released as early as the dropped one did, until
-    one starts.  In a lasting overload (``State.overloaded``) the mean execution times of the older
-    ones count, too.  Running executions keep their keys.  Only policies whose keys are times
-    demote.  Of an undeclared callback only the first waiting execution is in the ready queue.  If
-    it is late, past its deadline, it counts as ready ``LATE_PATIENCE`` relative deadlines later,
-    and so does each that follows it until its queue has been empty.  So an overload of undeclared
-    callbacks never makes a declared deadline miss for long, and each gets its turn.
+7.  **Late queues.** ``CONTINUE`` lets late work go on as before.  ``DEMOTE`` lowers the priority
+    of a queue that comes first, if none of its executions can be in time at any of their sinks:
+    the time plus the mean execution times on the longest path to the sink is past its deadline.
+    Until one of it starts, the queue counts as released ``LATE_PATIENCE`` relative deadlines
+    later, and the job of its first execution does so at all later vertices.  So late work ages,
+    and each callback gets some time.  As long as another execution in the queue can be in time,
+    the queue goes by the first one that can, and by the earliest deadline that this can meet, so
+    a backlog is worked off.  In a lasting overload (``State.overloaded``) the mean execution times
+    of those before it count, too.  Age and place belong to the queue: if an execution is dropped
+    (rule 13, or live a full queue), the queue keeps the place that the dropped one had, or is as
+    late as it.  A preempted execution is checked by itself.  Running executions keep their keys.
+    Only policies whose keys are times demote.  Of undeclared callbacks it is not known how long
+    they take: their queue is late when its first execution is past its deadline, and remains so
+    until it is empty.  So an overload of undeclared callbacks never makes a declared deadline miss
+    for long, and each gets its turn.
 8.  **Ends.** A job ends as exactly one of completed, late, expired, failed, outdated.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
     Executions that have not started when their job expires or fails run (live: each has a message,
     which is never lost silently), but make no further edge true and are not judged.  Later
     failures change nothing.  The slot is free when no execution of the job waits, runs or is
     suspended.
-9.  **Polling.**  Under a policy that polls (``ros2``) the ready queue is the result of the last
-    poll.  When an idle worker finds it empty, it polls: the first waiting execution of every
-    entity (timer, subscription, …) forms the next round.  Executions that become ready later wait
-    for the next poll, as do those whose group is busy when they come first.  There is no
+9.  **Polling.**  Under a policy that polls (``ros2``) the ready heap is the result of the last
+    poll.  When an idle worker finds it empty, it polls: the queue that comes first of every entity
+    (timer, subscription, …) forms the next round, with one execution.  What becomes ready later
+    waits for the next poll, as do queues whose group is busy when they come first.  There is no
     preemption.
 10. **Several processes.**  If the callbacks of a DAG run in several processes (live), each process
     expects some of a job's vertices *here*.  The others count as done: they are not judged here
@@ -75,7 +76,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     *lead out*, to a vertex elsewhere: their messages belong to the job until they end.
 11. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
     the interpreter (reported by the driver, ``State.x_holds``) starts only if no running execution
-    with the same or a smaller priority holds it.  Until then it is deferred
+    with the same or a smaller priority holds it.  Until then its queue is deferred
     (``State.held_back``), and others overtake it.  If it is more urgent than all holders, it
     starts, unless the driver forbids it for the moment (``State.overtaking``, from
     ``queues.overtaking_pays``: the wait is short).  Live, those that it overtakes pause, or share
@@ -88,7 +89,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     preemption and no polling then.
 13. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
     one that has not started is dropped when that of a later job becomes ready.  So is a release of
-    a timer if its job is demoted then (``KEEP_TIMELY``).  A job without its source is
+    a timer that is late then (``KEEP_TIMELY``).  A job without its source is
     ``OUTDATED``; a dropped sink is not in time.
 14. **Importance.**  A vertex has the highest importance of the sinks that it leads to, over
     trigger and queue edges.  While an important sink is late, or the known execution times demand
@@ -107,45 +108,42 @@ from __future__ import annotations
 
 from heapq import heappop, heappush
 
-from mddag_executor.core.jobs import (
-    close_job,
-    deactivate,
-    demotes,
-    give_up,
-    judge,
-    outdate_sink,
-)
+from mddag_executor.core.jobs import close_job, deactivate, give_up, judge, outdate_sink
 from mddag_executor.core.overload import (
+    announce_late,
     demote,
-    demote_undeclared,
-    inherit_age,
-    late_priority,
+    drop_late,
+    is_late,
+    next_entry,
     note_late,
-    pass_on_age,
 )
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
-    add_stale,
+    come_forward,
+    enqueue,
     idle_worker,
-    is_stale,
     may_start,
-    next_queue,
+    next_heap,
     poll,
+    put,
+    unlink,
+    wait_alone,
     wait_for_poll,
 )
 from mddag_executor.core.state import (
     add_slot,
+    ALONE,
     COMPLETED,
     DISPATCH_OVERHEAD,
     DONE,
     DROP,
     DROPPED,
     FAILED,
+    HELD_BACK,
     LATE,
     LEADS_OUT,
     N_HOLDING,
     N_IDLE,
-    N_STALE,
     OPEN,
     ORDER,
     OUTDATED,
@@ -153,6 +151,7 @@ from mddag_executor.core.state import (
     PREEMPTIVE,
     PROPAGATE,
     QueueEntry,
+    READY,
     RUNNING,
     SINK_IN_TIME,
     SINK_LATE,
@@ -161,64 +160,52 @@ from mddag_executor.core.state import (
     SWITCH_OVERHEAD,
     WAITING,
 )
-from mddag_executor.core.tables import KEEP_ALL, KEEP_NEWEST, NEVER, Tables
+from mddag_executor.core.tables import KEEP_ALL, KEEP_NEWEST, Tables
 
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
-    """Put an execution into the ready queue (rule 3)."""
+    """Let an execution wait in its queue (rule 3)."""
     slot = s.x_slot[x]
     s.job_active[slot] += 1
     s.x_left[x] = s.x_cost[x]
     order = s.scalars[ORDER] = s.scalars[ORDER] + 1
+    vertex = s.x_vertex[x]
     s.x_key[x] = key(
-        t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], order) + (x,)
-    _enqueue(t, s, x)
-    keep = t.keep[s.x_vertex[x]]
-    if keep != KEEP_ALL:
+        t, vertex, s.job_release[slot], s.job_index[slot], order) + (s.x_queue[x],)
+    enqueue(t, s, x)
+    keep = t.keep[vertex]
+    if keep != KEEP_ALL and s.queue_first[s.x_queue[x]] != s.queue_last[s.x_queue[x]]:
         if keep == KEEP_NEWEST:
             _keep_newest(t, s, x, now)
         else:
             _keep_timely(t, s, x, now)
-        inherit_age(t, s, x)
 
 
 def _keep_newest(t: Tables, s: State, x: int, now: int) -> None:
-    """Drop the older of two waiting executions if only the newest is kept (rule 13)."""
-    vertex = s.x_vertex[x]
-    before = s.newest_ready[vertex]
-    s.newest_ready[vertex] = x
-    if before < 0 or before == x or s.x_state[before] != WAITING or s.x_started[before] >= 0:
-        return
-    older = before
-    if s.job_index[s.x_slot[before]] > s.job_index[s.x_slot[x]]:
-        s.newest_ready[vertex] = before
+    """Drop the older of the two executions in a queue of which only the newest is kept."""
+    older = s.x_previous[x]
+    if older < 0:
+        older = s.x_next[x]
+    if s.job_index[s.x_slot[older]] > s.job_index[s.x_slot[x]]:
         older = x
-    slot = s.x_slot[older]
-    if slot == s.x_slot[s.newest_ready[vertex]]:
-        return  # another message of a sync of the same job
-    if s.job_state[slot] == OPEN and s.job_hope[slot] < NEVER:
-        late_priority(t, s, older, -1, now)  # if it is late, the newer one gets its age
     _outdate(t, s, older, now)
 
 
 def _keep_timely(t: Tables, s: State, x: int, now: int) -> None:
-    """Drop the waiting releases of a timer before this one that are demoted, or should be."""
-    source = s.x_vertex[x]
-    slot = s.job_previous[s.x_slot[x]]
-    while slot >= 0 and s.job_hope[slot] < NEVER:
-        older = s.job_base[slot] + t.region_offset[source]
-        if s.x_state[older] != WAITING or s.x_started[older] >= 0:
-            return  # those before it have started, too
-        before = s.job_previous[slot]
-        late_priority(t, s, older, -1, now)
-        if s.job_demoted[slot] >= 0:
+    """Drop the waiting releases of a timer before this one that are late (rule 13)."""
+    older = s.x_previous[x]
+    while older >= 0:
+        before = s.x_previous[older]
+        if is_late(t, s, older, now):
             _outdate(t, s, older, now)
-        slot = before
+        older = before
 
 
 def _outdate(t: Tables, s: State, x: int, now: int) -> None:
     """Drop a waiting execution for that of a newer job, and its job or sink with it (rule 13)."""
     slot, vertex = s.x_slot[x], s.x_vertex[x]
+    if is_late(t, s, x, now):
+        announce_late(t, s, x, now)
     if s.job_state[slot] == OPEN:
         if t.n_predecessors[vertex] == 0:
             give_up(t, s, slot, OUTDATED, now)
@@ -234,8 +221,7 @@ def ready_undeclared(
     Make an undeclared callback ready: it is not judged, and has no job to account for.
 
     :param job: its index, for the key; ``group``, ``holds``: see ``State.x_group``, ``x_holds``.
-    :param queue: the queue of its callback, in which only the first execution can come first; -1:
-        it has none.
+    :param queue: the queue of its callback; -1: it waits alone.
     :return: the execution.
     """
     if len(s.undeclared) == 0:
@@ -243,57 +229,18 @@ def ready_undeclared(
     x = s.undeclared.pop()
     s.x_group[x] = group
     s.x_holds[x] = holds
-    order = s.scalars[ORDER] = s.scalars[ORDER] + 1
-    s.x_key[x] = key(t, t.n_vertices, now, job, order) + (x,)
+    s.x_queue[x] = queue
     slot = s.x_slot[x]
-    s.job_demoted[slot] = s.x_queue[x] = -1
-    s.job_hope[slot] = NEVER
-    if demotes(t, s, t.n_dags):
-        s.job_hope[slot] = now
-        s.x_queue[x] = queue
-        if queue >= 0:
-            if s.queue_first[queue] >= 0:
-                s.x_started[x] = -1
-                s.x_state[x] = WAITING
-                heappush(s.queue_rest[queue], (order, 0, 0, 0, x))
-                return x
-            s.queue_first[queue] = x
-    _enqueue(t, s, x)
-    return x
-
-
-def _leave_queue(t: Tables, s: State, x: int, now: int) -> None:
-    """Let the next undeclared execution of a queue come first; a late queue goes on late."""
-    queue = s.x_queue[x]
-    s.x_queue[x] = -1
-    rest = s.queue_rest[queue]
-    is_first = s.queue_first[queue] == x
-    if is_first:
-        s.queue_first[queue] = -1
-    while rest:
-        after = rest[0][4]
-        is_valid = s.x_queue[after] == queue and s.x_key[after][3] == rest[0][0]
-        if is_valid and not is_first:
-            break
-        heappop(rest)
-        if is_valid:  # else it was dropped
-            is_first = False
-            s.queue_first[queue] = after
-            heappush(s.ready, s.x_key[after])
-            if s.queue_late[queue] != 0:
-                demote_undeclared(t, s, after, now)
-    if s.queue_first[queue] < 0:
-        s.queue_late[queue] = 0
-
-
-def _enqueue(t: Tables, s: State, x: int) -> None:
-    """Let a fresh execution wait with its key."""
-    s.x_started[x] = -1
-    s.x_state[x] = WAITING
-    if s.scalars[POLLING] == 0:
-        heappush(s.ready, s.x_key[x])
+    s.job_release[slot] = now
+    s.job_demoted[slot] = -1
+    order = s.scalars[ORDER] = s.scalars[ORDER] + 1
+    s.x_key[x] = key(t, t.n_vertices, now, job, order) + (queue,)
+    if queue >= 0:
+        enqueue(t, s, x)
     else:
-        wait_for_poll(t, s, s.x_key[x])
+        s.x_started[x] = -1
+        wait_alone(s, x)
+    return x
 
 
 def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
@@ -305,31 +252,28 @@ def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
 
 
 def drop(t: Tables, s: State, x: int, now: int) -> None:
-    """
-    Drop a waiting execution, for example because its queue is full; it never runs.
-
-    Its entry remains in a queue as stale until it reaches the top or stale entries are the larger
-    part.
-    """
+    """Drop a waiting or refused execution, for example of a full queue: it never runs."""
     queue = s.x_queue[x]
-    # a refused execution is in no queue, and of undeclared ones only the first
-    in_queue = s.x_state[x] == WAITING and (queue < 0 or s.queue_first[queue] == x)
-    pass_on_age(t, s, x, now)
+    if s.x_state[x] == WAITING:
+        late = is_late(t, s, x, now)
+        if late:
+            announce_late(t, s, x, now)
+        unlink(s, x)
+        if late and s.queue_first[queue] >= 0:
+            drop_late(t, s, x, now)
+    elif s.x_state[x] == ALONE:
+        unlink(s, x)
     s.x_state[x] = DROPPED
     slot = s.x_slot[x]
     dag = s.job_dag[slot]
     s.decisions.append((DROP, dag, s.x_vertex[x], s.job_index[slot], x, now))
     group = s.x_group[x]
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
-        _release_group(s, group)  # it may have been its group's entry in the ready queue
+        _release_group(s, group)  # its entry may have been its group's in the ready heap
     if dag == len(s.free_slot):
         s.undeclared.append(x)
     else:
         deactivate(s, slot)
-    if queue >= 0:
-        _leave_queue(t, s, x, now)
-    if in_queue:
-        add_stale(s)
 
 
 # --- dispatch ------------------------------------------------------------------------------------
@@ -338,47 +282,54 @@ def peek(t: Tables, s: State, now: int) -> int:
     """
     Return the execution that is dispatched next, or -1 when none may run.
 
-    Entries that cannot be next leave the queue: dropped executions for good, those
-    with a busy group into the group's heap (rule 4) or to the next poll (rule 9), those that may
-    not start into a heap of deferred ones (rules 11 and 12).  Late ones are demoted (rule 7).
+    What cannot be next is set aside: if its group is busy in the group's heap (rule 4) or to the
+    next poll (rule 9), if it may not start with what is deferred (rules 11 and 12).  Late queues
+    are demoted (rule 7).
     """
     again = True
     while True:
-        queue = s.ready
-        if s.held_back or s.scalars[N_STALE] > 0:
-            queue = next_queue(t, s, True)
-        while queue:
-            entry = queue[0]
-            x = entry[4]
+        heap = s.ready
+        if s.held_back:
+            heap = next_heap(t, s, True)
+        while heap:
+            entry = heap[0]
+            x = s.queue_first[entry[4]] if entry[4] >= 0 else ~entry[4]
             group = s.x_group[x]
-            vertex = s.x_vertex[x]
             if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
-                heappop(queue)
+                heappop(heap)
                 if s.scalars[POLLING] == 0:
-                    heappush(s.group_heap[group], entry)
+                    _wait_for_group(s, entry, group)
                 else:
-                    wait_for_poll(t, s, entry)
-            elif (now > s.job_hope[s.x_slot[x]] + s.start_by[vertex]
-                    and demote(t, s, x, now)):
+                    wait_for_poll(s, entry)
+            elif (now > s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]
+                    and demote(t, s, heap, x, now)):
                 if group >= 0 and s.group_owner[group] == -1:
                     _release_group(s, group)  # others of the group may go first
             elif ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
                     and not may_start(t, s, entry)):
-                _defer(s, queue)
+                _defer(s, heap, group)
             else:
                 return x
-            queue = next_queue(t, s, False)
+            heap = next_heap(t, s, False)
         if not again or len(s.unpolled) == 0:
             return -1
         again = False  # a poll that finds only busy groups is the last
         poll(t, s)
 
 
-def _defer(s: State, queue: list[QueueEntry]) -> None:
-    """Defer the first execution of a queue; others of its callback group may go first."""
-    entry = heappop(queue)
+def _wait_for_group(s: State, entry: QueueEntry, group: int) -> None:
+    """Set an entry aside until its group is free (rule 4)."""
+    if entry[4] >= 0:
+        s.queue_place[entry[4]] = group
+    heappush(s.group_heap[group], entry)
+
+
+def _defer(s: State, heap: list[QueueEntry], group: int) -> None:
+    """Defer what comes first in a heap; others of its callback group may go first."""
+    entry = heappop(heap)
+    if entry[4] >= 0:
+        s.queue_place[entry[4]] = HELD_BACK
     heappush(s.held_back, entry)
-    group = s.x_group[entry[4]]
     if group >= 0 and s.group_owner[group] == -1:
         _release_group(s, group)
 
@@ -392,13 +343,23 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     x = peek(t, s, now)
     if x < 0:
         return -1
-    heappop(s.held_back if s.held_back and s.held_back[0][4] == x else s.ready)
     if worker < 0:
         worker = idle_worker(t, s, x)
+    queue = s.x_queue[x] if s.x_state[x] == WAITING else ~x
+    if s.ready and s.ready[0][4] == queue:
+        s.x_key[x] = heappop(s.ready)
+    else:
+        s.x_key[x] = heappop(s.held_back)
+    if queue >= 0:
+        s.queue_place[queue] = READY
+        after = s.queue_first[queue] = s.x_next[x]
+        if after < 0:
+            s.queue_last[queue] = s.queue_demoted[queue] = -1
+        else:
+            s.x_next[x] = s.x_previous[after] = -1
+            put(s, next_entry(t, s, queue, now))
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
-    if s.x_started[x] < 0:
-        s.passed_on[s.x_vertex[x]] = s.waits_since[s.x_vertex[x]] = -1
     s.x_started[x] = now
     s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
     s.worker_x[worker] = x
@@ -408,8 +369,6 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     group = s.x_group[x]
     if group >= 0:
         s.group_owner[group] = x
-    if s.x_queue[x] >= 0:
-        _leave_queue(t, s, x, now)
     return x
 
 
@@ -432,7 +391,8 @@ def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
         priority = s.x_key[s.worker_x[w]][0]
         if priority >= largest:
             worker, largest = w, priority
-    if largest <= s.x_key[x][0]:
+    key_of_first = s.queue_key[s.x_queue[x]] if s.x_state[x] == WAITING else s.x_key[x]
+    if largest <= key_of_first[0]:
         return -1
     victim = s.worker_x[worker]
     lend(s, victim)
@@ -447,9 +407,8 @@ def _put_back(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     s.scalars[ORDER] += 1
     slot = s.x_slot[x]
     s.x_key[x] = key(
-        t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER]) + (x,)
-    s.x_state[x] = WAITING
-    heappush(s.ready, s.x_key[x])
+        t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER]) + (~x,)
+    wait_alone(s, x)
 
 
 def lend(s: State, x: int) -> None:
@@ -494,9 +453,8 @@ def leave_group(s: State, x: int) -> None:
 
 
 def ask_again(s: State, x: int) -> None:
-    """Put a refused execution back into the ready queue: it waits with the same key (rule 4)."""
-    s.x_state[x] = WAITING
-    heappush(s.ready, s.x_key[x])
+    """Let a refused execution wait again, with the same key (rule 4)."""
+    wait_alone(s, x)
 
 
 def resume(
@@ -509,20 +467,16 @@ def resume(
     """
     if s.x_vertex[x] == t.n_vertices:
         order = s.scalars[ORDER] = s.scalars[ORDER] + 1
-        s.x_key[x] = key(t, t.n_vertices, now, job, order) + (x,)
-        slot = s.x_slot[x]
-        s.job_demoted[slot] = -1
-        if s.job_hope[slot] < NEVER:
-            s.job_hope[slot] = now
+        s.x_key[x] = key(t, t.n_vertices, now, job, order) + (~x,)
+        s.job_release[s.x_slot[x]] = now
     s.x_holds[x] = holds
-    s.x_state[x] = WAITING
-    heappush(s.ready, s.x_key[x])
+    wait_alone(s, x)
 
 
 def go_on_without(s: State, x: int) -> None:
     """Let a waiting execution that has run before go on without worker and interpreter."""
+    unlink(s, x)
     s.x_state[x] = RUNNING
-    add_stale(s)
 
 
 # --- completion ----------------------------------------------------------------------------------
@@ -575,11 +529,8 @@ def fail(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
 def _release_group(s: State, group: int) -> None:
     s.group_owner[group] = -1
     heap = s.group_heap[group]
-    while heap and is_stale(s, heap[0]):
-        heappop(heap)
-        s.scalars[N_STALE] -= 1
     if heap:
-        heappush(s.ready, heappop(heap))
+        come_forward(s, heappop(heap))
 
 
 def _complete_vertex(
@@ -593,7 +544,7 @@ def _complete_vertex(
         judge(t, s, slot, SINK_LATE if late else SINK_IN_TIME, vertex, deadline, now)
         if late:
             s.job_late[slot] += 1
-            note_late(t, s, slot, vertex, now)
+            note_late(t, s, vertex, now)
     if is_sink or s.expected[vertex] == LEADS_OUT:
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:

@@ -6,22 +6,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from heapq import heapify, heappush
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
 from mddag_executor.core.state import (
     add_group,
+    add_queue,
     add_slot,
-    add_undeclared_queue,
+    ALONE,
     as_object,
     Decision,
     empty,
     fill_state,
-    N_STALE,
     OPEN,
     State,
     SUSPENDED,
+    WAITING,
 )
 from mddag_executor.core.tables import Tables
 
@@ -116,20 +116,9 @@ class Scheduler:
         for dag in range(self.tables.n_dags):
             jobs.expire_idle(self.tables, self.state, dag, now)
 
-    def set_holds(self, x: int, holds: int) -> None:
-        """Set which interpreter a waiting execution needs; a deferred one may start again."""
-        state = self.state
-        state.x_holds[x] = holds
-        entry = state.x_key[x]
-        if entry in state.held_back:
-            state.held_back.remove(entry)
-            heapify(state.held_back)
-            heappush(state.ready, entry)
-
     def new_group(self) -> int:
         """Add a mutually exclusive callback group and return its number."""
         for place, group in enumerate(self._free_groups):
-            # Dropped executions may remain in it for a while.
             if self.state.group_owner[group] == -1 and not self.state.group_heap[group]:
                 del self._free_groups[place]
                 return group
@@ -141,7 +130,7 @@ class Scheduler:
 
     def new_queue(self) -> int:
         """Add a queue of an undeclared callback and return its number."""
-        return self._free_queues.pop() if self._free_queues else add_undeclared_queue(self.state)
+        return self._free_queues.pop() if self._free_queues else add_queue(self.state)
 
     def free_queue(self, queue: int) -> None:
         """Free the number of an empty queue, for reuse."""
@@ -156,12 +145,9 @@ class Scheduler:
     @property
     def queue_length(self) -> int:
         """Return the number of executions that wait, for a worker or for their group."""
-        waiting = sum(len(heap) for heap in self.state.group_heap)
-        waiting += sum(len(queue) for queue in self.state.entity_queue)
-        waiting += sum(len(rest) for rest in self.state.queue_rest)
-        waiting += len(self.state.held_back)
-        waiting += sum(map(self._is_refused, self.state.group_owner))
-        return len(self.state.ready) + waiting - self.state.scalars[N_STALE]
+        states = self.state.x_state
+        refused = sum(map(self._is_refused, self.state.group_owner))
+        return states.count(WAITING) + states.count(ALONE) + refused
 
     def _is_refused(self, x: int) -> bool:
         state = self.state

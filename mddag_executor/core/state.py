@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, TypeVar
 
-from mddag_executor.core.tables import NEVER, Tables
+from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 
-# States of an execution; a refused one is suspended, too.
-IDLE, WAITING, RUNNING, SUSPENDED, DONE, DROPPED = range(6)
+# States of an execution: it waits in its queue or alone (see ``queues``); a refused one is
+# suspended, too.
+IDLE, WAITING, ALONE, RUNNING, SUSPENDED, DONE, DROPPED = range(7)
 
 # States of a job.  Every ended job is in exactly one of the last six; only recordings of version 2
 # and before have aborted ones.
@@ -27,8 +28,11 @@ FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # Columns of ``scalars``.  ``FORGET_AT``: until when no measured execution time is too old.
-(ORDER, N_IDLE, N_STALE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY, FORGET_AT, N_SCALARS) = range(15)
+(ORDER, N_IDLE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
+ JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY, FORGET_AT, N_SCALARS) = range(14)
+
+# Where the entry of a queue is (``queue_place``), if not in the heap of a callback group.
+READY, HELD_BACK, UNPOLLED = -1, -2, -3
 
 # Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
 # them, or deadlines of DAGs.
@@ -48,7 +52,7 @@ SINK_COMPLETED = (SINK_IN_TIME, SINK_LATE)
 NOT_JUDGED = -2
 
 QueueEntry = tuple[int, int, int, int, int]
-"""An entry of the ready queue: the four integers of a key, then the execution."""
+"""An entry of a heap: the four integers of a key, then a queue, or ``~x`` of an execution."""
 
 Decision = tuple[int, int, int, int, int, int]
 Kind = TypeVar('Kind')
@@ -58,15 +62,16 @@ class State(NamedTuple):
     """Everything that changes during a run; see ``fill_state``."""
 
     scalars: list[int]
-    # heaps: the ready queue, the executions deferred for the interpreter or a worker, and for each
-    # callback group those that wait for it
+    # heaps with an entry for each queue that is not empty, and each execution that waits alone:
+    # what may come first, what is deferred for the interpreter or a worker, and for each callback
+    # group what waits for it
     ready: list[QueueEntry]
     held_back: list[QueueEntry]
     group_heap: list[list[QueueEntry]]
     group_owner: list[int]
-    # under a policy that polls: a heap for each entity, and the entities with entries
-    entity_queue: list[list[QueueEntry]]
-    unpolled: list[int]
+    # under a policy that polls: what waits for a poll, and by entity its first order, in a poll
+    unpolled: list[QueueEntry]
+    first_order: list[int]
     # workers: the execution of each, and, if processes have separate pools, its process (from 1)
     worker_x: list[int]
     pool: list[int]
@@ -74,11 +79,13 @@ class State(NamedTuple):
     overtaking: list[int]
     # the executions of undeclared callbacks that may be used again
     undeclared: list[int]
-    # by queue of an undeclared callback: its first waiting execution, or -1; a heap of the others,
-    # by order; whether the first was late since the queue was empty
+    # by queue: its first and its last execution, or -1; its entry, and where that is; the release
+    # that counts for its order since it was demoted, or -1
     queue_first: list[int]
-    queue_rest: list[list[QueueEntry]]
-    queue_late: list[int]
+    queue_last: list[int]
+    queue_key: list[QueueEntry]
+    queue_place: list[int]
+    queue_demoted: list[int]
     # by process, from 1: the least importance that is not demoted, and whether that needs too much
     demoted_below: list[int]
     overloaded: list[int]
@@ -93,18 +100,10 @@ class State(NamedTuple):
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
-    # by vertex: from when on its executions are checked (see ``overload``); with ``keep: newest``,
-    # the execution that became ready last; a heap of the demoted executions that wait, by order;
-    # the order of the one that a newer one made urgent last, or -1; of those that were dropped
-    # since the last one started, or -1: the least ``job_demoted``, and the least release of one
-    # that was not demoted; the known mean execution time, and whether it
-    # holds the interpreter; when that time was measured last, or -1: it is the declared one
+    # by vertex: how long after its release an execution is checked when it comes first (see
+    # ``overload``; NEVER: not); the known mean execution time, and whether it holds the
+    # interpreter; when that time was measured last, or -1: it is the declared one
     start_by: list[int]
-    newest_ready: list[int]
-    demoted: list[list[QueueEntry]]
-    urged: list[int]
-    passed_on: list[int]
-    waits_since: list[int]
     mean: list[int]
     holder: list[int]
     measured_at: list[int]
@@ -118,8 +117,6 @@ class State(NamedTuple):
     job_state: list[int]
     job_sinks_left: list[int]
     job_late: list[int]
-    # base of its latest starts: its release; NEVER: it continues when it is late
-    job_hope: list[int]
     # the release that counts for its order since it was demoted, or -1
     job_demoted: list[int]
     job_active: list[int]
@@ -131,8 +128,10 @@ class State(NamedTuple):
     x_state: list[int]
     x_pending: list[int]
     x_group: list[int]
-    # of an undeclared callback: the queue that it waits in, or -1
+    # the queue of its callback, or -1; in it, the next and the previous execution, or -1
     x_queue: list[int]
+    x_next: list[int]
+    x_previous: list[int]
     # which interpreter it holds while it runs, from 1; 0: none
     x_holds: list[int]
     x_worker: list[int]
@@ -193,12 +192,8 @@ def fill_state(
     s.scalars[JUDGE_FROM], s.scalars[JUDGE_UNTIL] = -NEVER, NEVER
     s.scalars[FORGET_AT] = NEVER
     for v in range(t.n_vertices + 1):
-        s.start_by.append(t.latest_start[v])
-        s.newest_ready.append(-1)
-        add_queue(s.demoted)
-        s.urged.append(-1)
-        s.passed_on.append(-1)
-        s.waits_since.append(-1)
+        demotes = t.on_late[t.dag_of[v]] == DEMOTE and urgency != OTHER_KEYS
+        s.start_by.append(t.latest_start[v] if demotes else NEVER)
         s.mean.append(t.mean_time[v])
         s.holder.append(0)
         s.measured_at.append(-1)
@@ -207,9 +202,11 @@ def fill_state(
         s.reach_by.append(t.reach_start[i])
     for _ in range(2):
         add_process(s)
+    for _ in range(len(t.leg_topic)):
+        add_queue(s)
     if polling != 0:
-        for _ in range(t.n_entities + 1):
-            add_queue(s.entity_queue)
+        for _ in range(t.n_entities):
+            s.first_order.append(NEVER)
     for _ in range(t.n_groups):
         add_group(s)
     for _ in range(n_workers):
@@ -236,7 +233,6 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
     s.job_state.append(FREE if dag < t.n_dags else OPEN)
     s.job_sinks_left.append(0)
     s.job_late.append(0)
-    s.job_hope.append(NEVER)
     s.job_demoted.append(-1)
     s.job_active.append(0)
     s.job_next.append(-1)
@@ -249,11 +245,13 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
     else:
         s.undeclared.append(s.job_base[slot])
     for vertex in range(t.first_vertex[dag], last):
-        for _ in range(t.n_legs[vertex]):
+        for leg in range(t.n_legs[vertex]):
             s.x_slot.append(slot)
             s.x_vertex.append(vertex)
             s.x_group.append(t.group[vertex])
-            s.x_queue.append(-1)
+            s.x_queue.append(t.first_leg[vertex] + leg)
+            s.x_next.append(-1)
+            s.x_previous.append(-1)
             s.x_holds.append(0)
             s.x_key.append((0, 0, 0, 0, 0))
             s.x_state.append(IDLE)
@@ -286,18 +284,20 @@ def add_process(s: State) -> None:
 def add_group(s: State) -> int:
     """Add a mutually exclusive callback group and return its number."""
     s.group_owner.append(-1)
-    add_queue(s.group_heap)
+    add_heap(s.group_heap)
     return len(s.group_owner) - 1
 
 
-def add_undeclared_queue(s: State) -> int:
-    """Add a queue of an undeclared callback and return its number."""
+def add_queue(s: State) -> int:
+    """Add an empty queue and return its number."""
     s.queue_first.append(-1)
-    add_queue(s.queue_rest)
-    s.queue_late.append(0)
+    s.queue_last.append(-1)
+    s.queue_key.append((0, 0, 0, 0, 0))
+    s.queue_place.append(READY)
+    s.queue_demoted.append(-1)
     return len(s.queue_first) - 1
 
 
-def add_queue(queues: list[list[Any]]) -> None:
-    """Add an empty queue."""
-    queues.append([])
+def add_heap(heaps: list[list[Any]]) -> None:
+    """Add an empty heap."""
+    heaps.append([])

@@ -14,11 +14,9 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     none.  Messages of known publications go to the job of these (``jobs``), others may enter from
     another process (``other_processes``), and all others run as undeclared.
 2.  *Queue depth.*  A queue retains as many messages as its QoS allows; beyond that the oldest are
-    dropped and counted, and with ``DEMOTE`` late ones after it: a queue that stays full would make
-    every message wait for as many periods.  Undeclared callbacks run in the order in which they
-    became ready, so that none starves.  In a queue that overflows permanently, every message is
-    young, and its callback would always come after all others.  So the next message takes over the
-    position of the dropped one.
+    dropped and counted, and with ``DEMOTE`` late ones of jobs after it: a queue that stays full
+    would make every message wait for as many periods.  The place of a dropped message is its
+    queue's (``core.queues``), so a queue that overflows permanently gets its turn.
 3.  *The core decides* what to run (``dispatch``), and handles the ends of executions
     (``finished``, ``suspended``, ``refused``, …): see ``core.rules``.
 4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
@@ -42,9 +40,10 @@ from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.estimates import note_time
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import is_judged, judge_from
-from mddag_executor.core.overload import admit, inherit_age, is_late
-from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from
+from mddag_executor.core.overload import admit, is_late
+from mddag_executor.core.queues import first_of, overtaking_pays, overtaking_pays_from
 from mddag_executor.core.state import (
+    ALONE,
     EXPIRED,
     IDLE,
     JUDGE_FROM,
@@ -195,12 +194,12 @@ class Engine:
         entity = work.entity
         if entity.removed or self._finished:
             return
-        if entity.depth and len(entity.waiting) >= entity.depth:
-            self._drop_oldest(entity, now)
         if entity.source >= 0:
             self._start_job(work, max(entity.since, min(release, now)), now)
             if stamp >= 0 and self.other_processes is not None and work.origin is not None:
                 self.other_processes.note(stamp, work.origin)
+            if 0 < entity.depth < len(entity.waiting):
+                self._drop_oldest(entity, now)
             return
         if isinstance(origin, Announced):
             origin = self._entering(
@@ -211,53 +210,51 @@ class Engine:
             if entity.callback is not None:
                 entity.unattributed += 1
             self.ready(work, now)
+        elif 0 < entity.depth < len(entity.waiting):
+            self._drop_oldest(entity, now)
 
     def ready(self, work: Work, now: int) -> None:
         """Handle undeclared work: a message, request, guard condition, waitable or task."""
         entity = work.entity
         if entity.removed or self._finished:
             return
-        if entity.waiting and 0 < entity.depth <= len(entity.waiting):
-            self._replace_oldest(work, now)
-            return
         self.undeclared += 1
         work.ready_ns = now
-        if not self._is_bypassed:
+        waiting = entity.waiting
+        if 0 < entity.depth <= len(waiting):
+            self._core()
+        elif not self._is_bypassed:
             self._is_bypassed = self._may_bypass and self._is_core_empty()
         if self._is_bypassed:
             x = work.x = self._last_id = self._last_id - 1
-            entity.waiting[x] = None
+            waiting[x] = None
             self._lane.append(work)
-        else:
-            self._enqueue(work)
+            entity.ready += 1
+            return
+        self._enqueue(work)
         entity.ready += 1
+        if 0 < entity.depth < len(waiting):
+            self._drop_oldest(entity, now)
 
     def _enqueue(self, work: Work) -> None:
         entity, since = work.entity, work.ready_ns
+        if entity.queue < 0:
+            entity.queue = self.scheduler.new_queue()
         if entity.callback is not None and entity.waiting and self._keys_are_times:
             # It belongs to no job, but comes after the messages that wait already.  Only the last
             # one, and the last one without a job, are compared: there may be many.
-            last = next(reversed(entity.waiting))
+            state, last = self._state, next(reversed(entity.waiting))
             since = max(since, entity.last_since)
             if last >= 0:
-                since = max(since, self._state.x_key[last][0] + 1 - self._default_deadline)
+                after = state.x_key[last][0]
+                if state.x_state[last] == WAITING:  # its queue may be late
+                    after = max(after, state.queue_key[state.x_queue[last]][0])
+                since = max(since, after + 1 - self._default_deadline)
         entity.last_since = since
-        if entity.queue < 0:
-            entity.queue = self.scheduler.new_queue()
         x = work.x = self.scheduler.ready_undeclared(
-            entity.ready, entity.group, self._holds(entity), entity.queue, since)
+            entity.ready, entity.group, entity.habit.holds, entity.queue, since)
         entity.waiting[x] = None
         self._work[x] = work
-
-    def _holds(self, entity: Entity) -> int:
-        """Return whether the next execution holds the GIL; those that wait must not differ."""
-        holds = entity.habit.holds
-        last = next(reversed(entity.waiting), -1)
-        if last >= 0 and self._state.x_holds[last] != holds:  # one would overtake the other
-            for x in entity.waiting:
-                if x >= 0:  # else it bypasses the core for the moment
-                    self.scheduler.set_holds(x, holds)
-        return holds
 
     def allow_bypass(self) -> None:
         """Let undeclared executions bypass the core, if the policy runs them as they come."""
@@ -366,41 +363,17 @@ class Engine:
     def _start(self, work: Work, x: int, now: int) -> None:
         entity, state = work.entity, self._state
         state.x_group[x] = entity.group
-        state.x_holds[x] = self._holds(entity)
+        state.x_holds[x] = entity.habit.holds
         self._core().ready(x, now)
         work.x = x
         work.ready_ns = now
         entity.ready += 1
-        if not entity.waiting:
-            inherit_age(self.tables, state, x)
         entity.waiting[x] = None
         self._work[x] = work
         if state.decisions:
             self._decided(now)  # it replaced an older one, which was dropped
 
     # --- dropped work --- ------------------------------------------------------------------------
-
-    def _replace_oldest(self, work: Work, now: int) -> None:
-        """Drop the oldest message of an undeclared callback; the callback keeps its position."""
-        self._core()
-        entity = work.entity
-        places = iter(entity.waiting)
-        first, second = next(places), next(places, -1)
-        oldest = self._work[first]
-        if second < 0:
-            oldest.x = -1
-            self.undeclared += 1
-            self.verdicts.dropped(entity, NO_ORIGIN, 'qos_depth', now)
-            work.x = first
-            work.ready_ns = now
-            entity.ready += 1
-            self._work[first] = work
-            return
-        heir = self._work[second]
-        self._work[first], self._work[second] = heir, oldest
-        heir.x, oldest.x = first, second
-        self._drop(entity, second, 'qos_depth', now)
-        self.ready(work, now)
 
     def _drop(self, entity: Entity, x: int, reason: str, now: int) -> None:
         del entity.waiting[x]
@@ -411,14 +384,15 @@ class Engine:
         self._decided(now)
 
     def _drop_oldest(self, entity: Entity, now: int) -> None:
-        """Drop the oldest message of a full queue, and the next ones while these are late."""
+        """Drop the oldest message of a queue with one too many, and late ones after it."""
         self._core()
         waiting = entity.waiting
         self._drop(entity, next(iter(waiting)), 'qos_depth', now)
-        while waiting and is_late(self.tables, self._state, x := next(iter(waiting)), now):
+        while len(waiting) > 1:
+            x = next(iter(waiting))
+            if self._work[x].origin is None or not is_late(self.tables, self._state, x, now):
+                break
             self._drop(entity, x, 'qos_depth', now)
-        if waiting:
-            inherit_age(self.tables, self._state, next(iter(waiting)))
 
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""
@@ -449,7 +423,9 @@ class Engine:
     def patience(self) -> int:
         """Return how long what is ready may wait for a callback that was expected to end, ns."""
         ready = self._state.ready
-        vertex = self._state.x_vertex[ready[0][4]] if ready else self.tables.n_vertices
+        vertex = self.tables.n_vertices
+        if ready:
+            vertex = self._state.x_vertex[first_of(self._state, ready[0])]
         return min(GUARD_NS, max(
             2 * SHORT_CALLBACK_NS, self.tables.rad_offset[vertex] // GUARD_PART))
 
@@ -480,7 +456,7 @@ class Engine:
                 self._core()
         if work is None:
             state = self._state
-            if not self._core_has_waiting():
+            if not (state.ready or state.held_back or state.unpolled):
                 return None
             if state.worker_x[worker] >= 0:
                 if not state.scalars[N_IDLE]:
@@ -506,7 +482,7 @@ class Engine:
         if x < 0:
             return None
         work = self._work.pop(x)
-        work.entity.waiting.pop(x, None)  # a suspended one was removed before
+        work.entity.waiting.pop(x, None)  # one that goes on was removed before
         work.worker = worker
         if state.x_holds[x]:
             self.holders.append(work)
@@ -543,7 +519,7 @@ class Engine:
         x_holds, x_group, owners = state.x_holds, state.x_group, state.group_owner
         first = held_back[0] if held_back else None
         for entry in ready:
-            x = entry[4]
+            x = first_of(state, entry)
             group = x_group[x]
             if group >= 0 and owners[group] >= 0 and owners[group] != x:
                 continue
@@ -689,12 +665,12 @@ class Engine:
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
-        core = self._core()
+        self._core()
         work.entity.busy_ns += end - start
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker, goes_on=True)
         self._let_go(work)
-        core.suspend(work.x)
+        self.scheduler.suspend(work.x)
         self._work[work.x] = work
 
     def refused(self, work: Work, now: int) -> None:
@@ -727,12 +703,12 @@ class Engine:
 
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
-        core = self._core()
+        self._core()
         x, work.x = work.x, -1
         self._let_go(work)
         if work.origin is not None:
-            core.give_up(work.origin.slot, EXPIRED, now)
-        core.complete(x, now)
+            self.scheduler.give_up(work.origin.slot, EXPIRED, now)
+        self._complete(x, now)
         self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
         self._decided(now)
 
@@ -763,7 +739,7 @@ class Engine:
     def _record_waiting(self, now: int) -> None:
         """Record what waits at the end as dispatched then: a reader sees that it was not lost."""
         for x, work in self._work.items():
-            if (self._state.x_state[x] == WAITING and self._state.x_started[x] < 0
+            if (self._state.x_state[x] in (WAITING, ALONE) and self._state.x_started[x] < 0
                     and work.origin is not None):
                 self._record_dispatch(work, now, get_native_id(), -1)
 
@@ -823,7 +799,7 @@ class Engine:
         if state.decisions:
             yield f'the decisions {state.decisions} were not carried out'
         for x, work in self._work.items():
-            if work.x != x or state.x_state[x] not in (WAITING, SUSPENDED):
+            if work.x != x or state.x_state[x] not in (WAITING, ALONE, SUSPENDED):
                 yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
             elif (x in work.entity.waiting) != (state.x_started[x] < 0):
                 yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
@@ -837,7 +813,7 @@ class Engine:
             if entity.kind == SUBSCRIPTION and 0 < entity.depth < len(entity.waiting):
                 yield (f'{len(entity.waiting)} messages wait in a queue of depth '
                        f'{entity.depth}')
-        if len(self._work) != state.x_state.count(WAITING) + state.x_state.count(SUSPENDED):
+        if len(self._work) != sum(map(state.x_state.count, (WAITING, ALONE, SUSPENDED))):
             yield f'of what waits or is suspended, work is known of {sorted(self._work)} only'
         holding = sorted(x for x in state.worker_x if x >= 0 and state.x_holds[x])
         if sorted(work.x for work in self.holders) != holding:

@@ -8,7 +8,7 @@ Theory of operation
 1. The functions of the core and of the event loop are used unchanged: each is bound to a common
    namespace, in which the names of the others refer to their compiled versions, and the names of
    ``heapq`` to those of ``vectors``.  So a name, even of a constant, must mean the same in all
-   modules.  No rule exists twice.  Only ``add_queue`` is replaced, because an empty list has no
+   modules.  No rule exists twice.  Only ``add_heap`` is replaced, because an empty list has no
    type.  The policy is an additional field of the tables; the key function selects by it, so one
    compilation is enough for all policies.
 2. numba stores the machine code of the entry points (``kernel``) on disk (``cache=True``).  It
@@ -55,10 +55,10 @@ _MODULES = (
     tables, state, queues, jobs, overload, policies, rules, load, machine, deliveries, engine)
 _NOT_COMPILED = frozenset({
     # for plain lists
-    'empty', 'as_object', 'add_queue', 'rad_offsets', 'reached_sinks', 'mean_time',
+    'empty', 'as_object', 'add_heap', 'rad_offsets', 'reached_sinks', 'mean_time',
     'policy', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
 ENTRY_POINTS = ('free_run', 'run_each')
-_REPLACED = ('add_queue', 'heapify', 'heappop', 'heappush')
+_REPLACED = ('add_heap', 'heapify', 'heappop', 'heappush')
 
 
 def available() -> bool:

@@ -108,9 +108,8 @@ def run_each(
 def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
     """Free the results of a run."""
     s, m = as_state(state), as_machine(machine)
-    for nested in (s.group_heap, s.entity_queue, s.demoted):
-        for place in range(len(nested)):
-            free(nested[place])
+    for group in range(len(s.group_heap)):
+        free(s.group_heap[group])
     for process in range(len(m.lock_queue)):
         free(m.lock_queue[process])
     for structure, fields in ((state, STATE_FIELDS), (deliveries, DELIVERIES_FIELDS),

@@ -35,8 +35,8 @@ from typing import NamedTuple
 from mddag_executor.core.queues import first_waiting, overtaking_pays, overtaking_pays_from
 from mddag_executor.core.rules import progress
 from mddag_executor.core.state import (
+    add_heap,
     add_process,
-    add_queue,
     N_HOLDING,
     PREEMPTIVE,
     State,
@@ -102,7 +102,7 @@ def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> Non
         while len(s.overtaking) <= t.process[vertex]:
             add_process(s)
     for _ in range(len(s.overtaking)):
-        add_queue(m.lock_queue)
+        add_heap(m.lock_queue)
         m.lock_had.append(-1)
         m.switch_at.append(NEVER)
 

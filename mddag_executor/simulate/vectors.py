@@ -270,8 +270,8 @@ def _overload_clear(vector: Any) -> Any:
 
 
 @njit
-def add_queue(vector):
-    """Append an empty vector to a vector of vectors, like ``core.state.add_queue``."""
+def add_heap(vector):
+    """Append an empty vector to a vector of vectors, like ``core.state.add_heap``."""
     length = _get_word(vector, 1)
     if length == _get_word(vector, 2):
         _grow(vector, 3)

@@ -15,18 +15,19 @@ Its reading of the documents:
   happened. What is preempted queues up again, behind all that is there.
 * A DAG with ``max_active_jobs`` open jobs loses the oldest when one more is released: it expires.
   What it has ready or running goes on, without consequences.
-* ``demote`` (``rad``, ``gedf``, ``llf``): an execution that would start next, and cannot make any
-  deadline that it leads to any more, if every vertex on the longest way takes its mean time, goes
-  from then on as if its job were released ten relative deadlines later. As long as only some
-  deadlines are out of reach, ``rad`` and ``llf`` go by those within reach. One that became ready
-  later at the same vertex does not go before it: if it is late, too, it goes directly behind the
-  oldest; if not, the oldest goes as early as it. If the mean times of all vertices need more than
-  the workers, it is late if the mean time of each execution that was demoted there leaves it no
-  deadline within reach.
-* ``keep: newest`` at a source or sink: one of an earlier job that waits there and has never run
-  vanishes when the next one is ready. So does one of a timer that cannot make any deadline that it
-  leads to any more, with ``demote``. Until one of the callback starts, the next ones go as early
-  as the earliest that vanished: by its job's release, or if it was late by the one that counted.
+* What waits at a vertex and has never run is its queue. The first by key of these is its head, and
+  runs first. The queue has a place among all that waits: the least key of those that have been in
+  it since one of it ran last, also of those that vanished.
+* ``demote`` (``rad``, ``gedf``, ``llf``): if the head would start next, and is late for a deadline
+  that it leads to, if every vertex on the longest way takes its mean time, then the queue gets the
+  place of the first in it that can be in time, by its deadlines within reach (``rad``, ``llf``).
+  If the mean times of all vertices need more than the workers, those before it in the queue take
+  their time, too. If there is none, the queue goes as if the job of its head were released ten
+  relative deadlines later, until one of it runs; as do the later vertices of that job. An
+  execution that was preempted is a queue by itself.
+* ``keep: newest`` at a source or sink: of two in a queue the one of the earlier job vanishes. So
+  does one of a timer that cannot make any deadline that it leads to any more, with ``demote``,
+  when a later one is ready. If one vanishes that is late, its queue is as late as it.
 * ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
   the next round is, of all that waits, the first of each callback. The worker goes through it by
   kind (timers, subscriptions and syncs, services), then by the callback's place in the file, and
@@ -102,7 +103,8 @@ class Execution:
     left: int
     arrival: int
     has_run: bool = False
-    lowered: int | None = None  # its priority since it was demoted
+    lowered: int | None = None  # its priority, if it was preempted and then demoted
+    running_as: int = 0  # the priority with which it was started
 
 
 class BruteForce:
@@ -119,11 +121,9 @@ class BruteForce:
         self.tick = tick
         self.running = [None] * case.workers
         self.waiting = []
-        # by DAG and vertex: the demoted executions by arrival, and the arrival of the urged one
+        # by DAG and vertex: the place of the queue, and the release by which it is late
+        self.places = {}
         self.demoted = {}
-        self.passed_on = {}
-        self.waits_since = {}
-        self.urged = {}
         self.round = []
         self.jobs = []
         self.events = []
@@ -181,62 +181,73 @@ class BruteForce:
         return self._priority(
             execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
 
+    def _queue(self, key):
+        """Return what waits at a vertex of a DAG and has never run, the head first."""
+        return sorted((e for e in self.waiting if not e.has_run and self._at(e) == key),
+                      key=self.key)
+
+    @staticmethod
+    def _at(execution):
+        return execution.job.dag.index, execution.vertex.index
+
+    def _place_of(self, execution):
+        """Return where an execution that waits comes among all others."""
+        return self.key(execution) if execution.has_run else self.places[self._at(execution)]
+
     def _demotes(self, dag):
         return dag.on_late == 'demote' and self.policy in ('rad', 'gedf', 'llf')
 
     def _demote(self, execution):
-        """Change a priority if the next execution is late or behind one; return whether it did."""
-        job, vertex = execution.job, execution.vertex
-        if not self._demotes(job.dag):
+        """Move back what would start next, if it is late; return whether it moved."""
+        if not self._demotes(execution.job.dag) or not self._late_sinks(execution, 0):
             return False
-        key = job.dag.index, vertex.index
-        demoted = self.demoted.setdefault(key, [])
-        while demoted and (demoted[0][1] not in self.waiting
-                           or demoted[0][1].arrival != demoted[0][0]):
-            del demoted[0]
-        if self.urged.get(key) == execution.arrival:
+        queue = [execution] if execution.has_run else self._queue(self._at(execution))
+        lowest = None
+        for ahead, each in enumerate(queue):
+            within = {*self._starts(each)} - self._late_sinks(each, ahead)
+            if within:
+                lowest = self._priority(each, within)
+                break
+        if lowest is None:
+            lowest = self._late_priority(execution, not execution.has_run)
+        place = self._place_of(execution)
+        if lowest <= place[0]:
             return False
-        older = None
-        if not execution.has_run and demoted and demoted[0][0] < execution.arrival:
-            older = demoted[0][1]
-        lowest = self._demoted_priority(execution, older, len(demoted))
-        if lowest > self.priority(execution):
+        if execution.has_run:
             execution.lowered = lowest
-            if not execution.has_run:
-                demoted.append((execution.arrival, execution))
-                demoted.sort(key=lambda each: each[0])
-            return True
-        if older is None or self.priority(older) <= self.priority(execution):
-            return False
-        older.lowered = self.priority(execution)
-        self.urged[key] = older.arrival
+        else:
+            self.places[self._at(execution)] = (lowest, *place[1:])
         return True
 
-    def _demoted_priority(self, execution, older, ahead):
-        """Return the priority by the deadlines within reach, or later if there is none."""
+    def _starts(self, execution):
+        return self.laxity[self._at(execution)]
+
+    def _late_sinks(self, execution, ahead):
+        """Return the sinks at which an execution cannot be in time, behind others."""
         job, vertex = execution.job, execution.vertex
-        unit = 1 if self.policy == 'llf' else self.tick
-        done = (self.case.ticks[job.dag.index][vertex.index] - execution.left) * self.tick
-        starts = self.laxity[job.dag.index, vertex.index]
-        now = (self.now - job.release) * self.tick
+        begin = (self.now - job.release) * self.tick
         if execution.has_run:
-            now -= max(0, done)
-        if older is not None and self.is_overloaded:
-            now += ahead * mean(vertex)
-        within = {sink for sink, start in starts.items() if now <= start}
-        lowest = self._priority(execution, within or {*starts})
-        if within:
-            since = self.waits_since.get((job.dag.index, vertex.index), job.release)
-            return lowest - max(0, job.release - since) * self.tick // unit
-        if not within and older is not None:
-            return self.priority(older)
-        if not within:
-            if job.demoted is None:
-                deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
-                job.demoted = self.passed_on.pop(
-                    (job.dag.index, vertex.index), self.now * self.tick + 10 * deadline)
-            lowest += (job.demoted - job.release * self.tick) // unit
-        return lowest
+            done = self.case.ticks[job.dag.index][vertex.index] - execution.left
+            begin -= max(0, done) * self.tick
+        if self.is_overloaded:
+            begin += ahead * mean(vertex)
+        return {sink for sink, start in self._starts(execution).items() if begin > start}
+
+    def _late_priority(self, execution, in_queue):
+        """Return the priority ten deadlines after the execution, or its queue, was late first."""
+        job, key = execution.job, self._at(execution)
+        since = [each for each in (job.demoted, self.demoted.get(key) if in_queue else None)
+                 if each is not None]
+        if not since:
+            deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
+            since = [self.now * self.tick + 10 * deadline]
+        if job.demoted is None:
+            job.demoted = min(since)
+        if in_queue:
+            self.demoted[key] = min(since)
+        unit = 1 if self.policy == 'llf' else self.tick
+        return self._priority(execution, {*self._starts(execution)}) + (
+            min(since) - job.release * self.tick) // unit
 
     def _priority(self, execution, sinks):
         job = execution.job
@@ -304,44 +315,30 @@ class BruteForce:
 
     def _ready(self, job, vertex):
         new = Execution(job, vertex, self.case.ticks[job.dag.index][vertex.index], self._arrival())
+        key = self._at(new)
         self.waiting.append(new)
-        waiting = [e for e in self.waiting if e.vertex is vertex and not e.has_run]
-        newest = max(e.job.index for e in waiting)
-        older = [e for e in waiting if e.job.index < newest]
-        is_open = [e for e in older if e.job.outcome is None and self._demotes(job.dag)]
-        if vertex.callback.keep != 'newest' and vertex.callback.kind != 'timer':
-            return
-        for e in reversed(is_open):
-            self._demoted_priority(e, None, 0)
-        self._drop(older if vertex.callback.keep == 'newest'
-                   else [e for e in is_open if e.job.demoted is not None])
-        age = self.passed_on.get((job.dag.index, vertex.index))
-        if age is not None and new in self.waiting:
-            unit = 1 if self.policy == 'llf' else self.tick
-            starts = self.laxity[job.dag.index, vertex.index]
-            aged = self._priority(new, {*starts}) + (age - job.release * self.tick) // unit
-            if aged < self.priority(new):
-                new.lowered = aged
-                self.urged[job.dag.index, vertex.index] = new.arrival
-        since = self.waits_since.get((job.dag.index, vertex.index))
-        if since is not None and new in self.waiting:
-            unit = 1 if self.policy == 'llf' else self.tick
-            starts = self.laxity[job.dag.index, vertex.index]
-            aged = self._priority(new, {*starts}) - (job.release - since) * self.tick // unit
-            if aged < self.priority(new):
-                new.lowered = aged
+        self.places[key] = min(self.key(new), self.places.get(key, self.key(new)))
+        queue = self._queue(key)
+        if vertex.callback.keep == 'newest':
+            self._drop(sorted(queue, key=lambda e: e.job.index)[:-1])
+        elif vertex.callback.kind == 'timer':
+            for older in reversed(queue[:queue.index(new)]):
+                if self._is_late(older):
+                    self._drop([older])
+
+    def _is_late(self, execution):
+        return self._demotes(execution.job.dag) and (
+            self._late_sinks(execution, 0) == {*self._starts(execution)})
 
     def _drop(self, dropped):
-        for old in sorted(dropped, key=lambda e: -e.job.index):
-            self.waiting.remove(old)
+        for old in dropped:
             job, sink = old.job, old.vertex.index
-            key = job.dag.index, sink
-            if self.policy in ('rad', 'gedf', 'llf'):
-                if job.demoted is not None:
-                    self.passed_on[key] = min(job.demoted, self.passed_on.get(key, job.demoted))
-                else:
-                    self.waits_since[key] = min(
-                        job.release, self.waits_since.get(key, job.release))
+            late = self._is_late(old)
+            self.waiting.remove(old)
+            if late:
+                lowest = self._late_priority(old, True)
+                after = self.key(self._queue(self._at(old))[0])
+                self.places[self._at(old)] = (min(lowest, after[0]), *after[1:])
             if job.outcome is not None:
                 continue
             if old.vertex.predecessors:
@@ -438,8 +435,8 @@ class BruteForce:
         if self.policy == 'ros2':
             best = self._next_of_round()
         else:
-            able = [e for e in self.waiting if not self._blocked(e)]
-            best = min(able, key=self.key) if able else None
+            able = [e for e in self._heads() if not self._blocked(e)]
+            best = min(able, key=self._place_of) if able else None
         if best is None:
             return False
         if self._demote(best):
@@ -450,8 +447,8 @@ class BruteForce:
         if not self.case.preemptive:
             return False
         worst, worker = max(
-            (self.priority(e), w) for w, e in enumerate(self.running) if e is not None)
-        if worst <= self.priority(best):
+            (e.running_as, w) for w, e in enumerate(self.running) if e is not None)
+        if worst <= self._place_of(best)[0]:
             return False
         victim = self.running[worker]
         self._note('preempt', worker, victim)
@@ -462,6 +459,11 @@ class BruteForce:
         self.waiting.append(victim)
         return True
 
+    def _heads(self):
+        """Return what may start: the head of each queue, and what has run before."""
+        queues = {self._at(e) for e in self.waiting if not e.has_run}
+        return [*(self._queue(key)[0] for key in queues), *(e for e in self.waiting if e.has_run)]
+
     def _next_of_round(self):
         """Return what a free worker finds next, in this round or in a new one."""
         if None not in self.running:
@@ -469,21 +471,27 @@ class BruteForce:
         for new_round in (False, True):
             if new_round:
                 by_callback = {}
-                for e in self.waiting:
-                    by_callback.setdefault(e.vertex.callback.key, []).append(e)
-                self.round = [min(each, key=lambda e: e.arrival) for each in by_callback.values()]
+                for e in self._heads():
+                    by_callback.setdefault(e.vertex.callback.key, []).append(self._at(e))
+                self.round = [min(each, key=self.places.get) for each in by_callback.values()]
             while self.round:
-                first = min(self.round, key=self.priority)
-                self.round.remove(first)
-                if first in self.waiting and not self._blocked(first):
-                    return first
+                key = min(self.round, key=self.places.get)
+                self.round.remove(key)
+                head = self._queue(key)[0]
+                if not self._blocked(head):
+                    return head
         return None
 
     def _start(self, execution, worker):
+        key = self._at(execution)
         self.waiting.remove(execution)
-        if not execution.has_run:
-            self.passed_on.pop((execution.job.dag.index, execution.vertex.index), None)
-            self.waits_since.pop((execution.job.dag.index, execution.vertex.index), None)
+        if execution.has_run:
+            execution.running_as = self.priority(execution)
+        else:
+            execution.running_as = self.places.pop(key)[0]
+            self.demoted.pop(key, None)
+            if queue := self._queue(key):
+                self.places[key] = self.key(queue[0])
         execution.has_run = True
         execution.left += self.case.dispatch_overhead
         self.running[worker] = execution

@@ -16,8 +16,6 @@ from hypothesis.stateful import initialize, invariant, precondition, rule, RuleB
 from mddag_executor.core import legs_of, NEVER, POLICIES, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.invariants import broken_invariants
-from mddag_executor.core.overload import _change_key
-from mddag_executor.core.queues import SWEEP_AT
 from mddag_executor.core.state import (
     COMPLETED,
     DROP,
@@ -186,9 +184,9 @@ class LiveDriver(RuleBasedStateMachine):
         holders = [run for run in self.with_worker() if run.holds]
         x = self.scheduler.take(idle[worker % len(idle)], self.now)
         self.settle()
-        keys = self.state.x_key  # those that were demoted have others now
-        able = [run for run in waiting if run.fate == WAITING and not self.blocked(run)
-                and not (run.holds and any(keys[holder.x][0] <= keys[run.x][0]
+        able = [run for run in waiting if run.fate == WAITING and self.is_head(run)
+                and not self.blocked(run)
+                and not (run.holds and any(self.key(holder)[0] <= self.key(run)[0]
                                            for holder in holders))]
         if x < 0:
             assert not self.polled(able), 'a worker idles while something may run'
@@ -196,7 +194,7 @@ class LiveDriver(RuleBasedStateMachine):
         run = self.by_x[x]
         assert run in able
         if not self.scheduler.policy.polling:  # what waits for the next poll may be smaller
-            assert keys[run.x] == min(keys[other.x] for other in able), 'a smaller key waits'
+            assert self.key(run) <= min(self.key(other) for other in able), 'a smaller key waits'
         run.fate, run.began, run.owns = RUNNING, True, True
         worker = self.state.x_worker[x]
         assert worker in idle
@@ -263,13 +261,6 @@ class LiveDriver(RuleBasedStateMachine):
         if what == 'suspend':
             run.fate, run.lent = SUSPENDED, False
         run.lent = run.lent or what == 'lend'
-
-    @precondition(methodcaller('with_fate', WAITING))
-    @rule(data=st.data(), holds=HOLDS)
-    def learn(self, data, holds):
-        run = data.draw(st.sampled_from(self.with_fate(WAITING)))
-        self.scheduler.set_holds(run.x, int(holds))
-        run.holds = holds
 
     @precondition(methodcaller('owners'))
     @rule(data=st.data(), may=st.booleans())
@@ -416,6 +407,26 @@ class LiveDriver(RuleBasedStateMachine):
     def open_jobs(self):
         return [job for job in self.jobs if job.end is None]
 
+    def queue(self, run):
+        """Return the others that wait in the queue of a run."""
+        if run.began or run.vertex == self.tables.n_vertices or run.fate != WAITING:
+            return []
+        return [other for other in self.alive() if other is not run and other.fate == WAITING
+                and not other.began and (other.vertex, other.leg) == (run.vertex, run.leg)]
+
+    def is_head(self, run):
+        """Return whether a run is the first in its queue, or one that it has just left."""
+        return all(self.state.x_key[run.x] <= self.state.x_key[other.x]
+                   for other in self.queue(run) if other.x not in self.state.worker_x) or (
+                       run.x in self.state.worker_x)
+
+    def key(self, run):
+        """Return the four integers by which a run is ordered: those of its queue."""
+        state = self.state
+        if run.x in state.worker_x or state.x_key[run.x][4] < 0:
+            return state.x_key[run.x][:4]
+        return state.queue_key[state.x_queue[run.x]][:4]
+
     def blocked(self, run):
         return run.group >= 0 and any(
             other is not run and other.owns and other.group == run.group
@@ -509,24 +520,22 @@ def test_dropped_executions_leave_the_queues():
     core = live(declaration([
         {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us'}]), policy_name='ros2')
     kept = core.source(core.release(0, 0, 0, 0))
-    for i in range(3 * SWEEP_AT):
-        core.drop(core.ready_undeclared(i, -1, 0, -1, 0), 0)
+    queue = core.new_queue()
+    for i in range(200):
+        core.drop(core.ready_undeclared(i, -1, 0, queue if i % 2 else -1, 0), 0)
     core.ready(kept, 1)
-    assert core.queue_length == 1
-    assert sum(map(len, core.state.entity_queue)) <= SWEEP_AT + 2
+    assert core.queue_length == len(core.state.unpolled) == 1 and not core.state.ready
     assert core.take(0, 2) == kept
     core.complete(kept, 3)
     assert (core.take(0, 4), core.queue_length) == (-1, 0)
 
 
-def test_an_execution_that_gets_an_earlier_key_back_runs_once():
+def test_the_place_of_a_dropped_execution_is_its_queues():
+    """Also among those of a later deadline; the next one starts with the old one's key."""
     core = live(workers=1)
-    x = core.ready_undeclared(0, -1, 0, -1, 0)
-    before = core.state.x_key[x][0]
-    for priority in (before + 1, before):
-        _change_key(core.state, x, priority)
-    for i in range(3 * SWEEP_AT):  # so that stale entries are removed
-        core.drop(core.ready_undeclared(i, -1, 0, -1, 0), 0)
-    assert core.queue_length == 1 and core.take(0, 1) == x
-    core.complete(x, 2)
-    assert (core.take(0, 3), core.queue_length) == (-1, 0)
+    queue, other = core.new_queue(), core.new_queue()
+    first = core.ready_undeclared(0, -1, 0, queue, 0)
+    second = core.ready_undeclared(0, -1, 0, other, 1)
+    third = core.ready_undeclared(0, -1, 0, queue, 2)
+    core.drop(first, 2)
+    assert [core.take(0, 2), core.complete(third, 3) and core.take(0, 3)] == [third, second]

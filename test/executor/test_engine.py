@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
 from mddag_executor.core.jobs import source_depth
-from mddag_executor.core.state import N_HOLDING, N_IDLE, N_STALE, WAITING
+from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
@@ -242,7 +242,7 @@ def test_no_queue_starves_a_callback_in_an_overload(depth, keep):
     assert max(after - before for before, after in zip(times, times[1:])) <= 1300 * MS
 
 
-def flooded(depths, tick_ms=2, allow_bypass=True):
+def flooded(depths, tick_ms=2):
     """
     Run a declared timer of 100 ms, deadline 50 ms, next to a flood of undeclared messages.
 
@@ -251,8 +251,6 @@ def flooded(depths, tick_ms=2, allow_bypass=True):
     """
     engine = new_engine(
         loads(graph(n='name: tick, timer: 100ms, deadline: 50ms')), default_deadline=100 * MS)
-    if allow_bypass:
-        engine.allow_bypass()
     timer = new_entity(holds=True)
     timer.source, timer.depth = 0, 2
     entities = [new_entity(depth=depth, holds=True) for depth in depths]
@@ -279,10 +277,9 @@ def flooded(depths, tick_ms=2, allow_bypass=True):
     return engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick'], ran
 
 
-@pytest.mark.parametrize('allow_bypass', [True, False])
 @pytest.mark.parametrize('depths', [(1,), (10,), (1000,), (10, 10, 1)])
-def test_an_undeclared_overload_takes_no_declared_deadline_down(depths, allow_bypass):
-    tick, ran = flooded(depths, allow_bypass=allow_bypass)
+def test_an_undeclared_overload_takes_no_declared_deadline_down(depths):
+    tick, ran = flooded(depths)
     assert counts(tick).in_time >= 98  # of 100; at first, all messages can be in time, too
     assert 480 <= sum(map(len, ran)) <= 500  # all the time that the timer leaves
     for each in ran:
@@ -306,9 +303,7 @@ def test_the_first_executions_of_a_callback_do_not_count():
 
 
 def test_a_message_of_a_job_comes_to_a_queue_that_is_full_of_short_ones_without_a_job():
-    """Those bypass the core."""
     one = OneUser(depth=2)
-    one.engine.allow_bypass()
     works = [one.hear(origin, 0) for origin in (None, None, one.publish(0))]
     assert [one.engine.dispatch(0, 0), one.user.dropped] == [works[1], 1]
 
@@ -343,29 +338,17 @@ def test_messages_without_a_job_keep_their_order_behind_a_late_one(policy):
 def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_more():
     """The first one is held back: another callback has the GIL."""
     engine, user = new_engine(workers=2), new_entity(holds=True)
-    engine.ready(Work(new_entity(holds=True), print), 0)
-    assert engine.dispatch(0, 0) is not None
+    other = Work(new_entity(holds=True), print)
+    engine.ready(other, 0)
+    assert engine.dispatch(0, 0) is other
     messages = [Work(user, print) for _ in range(2)]
     for message in messages:
         engine.ready(message, 1)
-        assert user.habit.holds == 0 or engine.dispatch(1, 1) is None
+        assert engine.dispatch(1, 1) is None
         user.habit.holds = 0
         engine.validate()
-    assert engine.dispatch(1, 1) is messages[0]
-
-
-def test_another_thread_may_learn_of_a_callback_while_the_bypass_ends():
-    engine, user = new_engine(), new_entity()
-    user.wall_ns = 0
-    engine.allow_bypass()
-    for _ in range(4):
-        engine.ready(Work(user, print), 0)
-    assert engine.dispatch(0, 0) is not None
-    answers = iter((0, 0, 1, 1))
-    user.habit = type('Habit', (), {'holds': property(lambda habit: next(answers))})()
-    assert not engine.may_start_more(0)
-    engine.validate()
-    assert {engine._state.x_holds[x] for x in user.waiting} == {1}
+    engine.finished(other, 1, 1, 1, 0, 0)
+    assert [engine.dispatch(worker, 1) for worker in (0, 1)] == messages
 
 
 @examples(150)
@@ -444,7 +427,7 @@ def test_what_is_urgent_waits_less_for_a_callback_that_was_expected_to_end(deadl
     assert check.at == 2 * MS + engine.patience() // 2
 
 
-class Twin:
+class Steps:
     """An engine with entities of several kinds, each work of which has a number."""
 
     def __init__(self, policy, workers=2):
@@ -463,7 +446,7 @@ class Twin:
         self.count = 0
 
     def do(self, step, which, now):
-        """Carry out one step; return what can be seen of it."""
+        """Carry out one step; return what has started."""
         engine, entity, started = self.engine, self.entities[which], None
         if step == 'ready':
             self.count += 1
@@ -505,6 +488,11 @@ class Twin:
             elif step != 'lend':
                 engine.finished(work, now, now, now, 0, work.worker, step == 'fail')
         engine.validate()
+        return started
+
+    def seen(self, started, now):
+        """Return what can be seen after a step."""
+        engine = self.engine
         return (
             started and (started.args, started.worker), engine.queue_length, engine.has_waiting,
             engine.idle_workers, engine.may_start_more(now),
@@ -512,16 +500,39 @@ class Twin:
              for each in self.entities])
 
 
-@examples(300)
-@given(st.sampled_from(sorted(POLICIES)), st.lists(st.tuples(st.sampled_from([
+STEPS = st.lists(st.tuples(st.sampled_from([
     'ready', 'ready', 'ready', 'dispatch', 'dispatch', 'finish', 'finish', 'suspend', 'resume',
-    'lend', 'rejoin', 'go_on', 'fail', 'remove']), st.integers(0, 4)), max_size=80))
+    'lend', 'rejoin', 'go_on', 'fail', 'remove']), st.integers(0, 4)), min_size=1, max_size=80)
+
+
+@examples(300)
+@given(st.sampled_from(sorted(POLICIES)), STEPS)
 def test_what_bypasses_the_core_runs_as_the_core_would_run_it(policy, steps):
-    twins = Twin(policy), Twin(policy)
+    twins = Steps(policy), Steps(policy)
     twins[1].engine.allow_bypass()
     for now, step in enumerate(steps):
-        seen = [twin.do(*step, now) for twin in twins]
+        seen = [twin.seen(twin.do(*step, now), now) for twin in twins]
         assert seen[0] == seen[1], step
+
+
+@examples(300)
+@given(st.sampled_from(sorted(POLICIES)), st.booleans(), STEPS)
+def test_work_of_an_entity_starts_in_its_order_and_is_never_lost(policy, slow, steps):
+    each = Steps(policy)
+    engine, started = each.engine, {}
+    for now, step in enumerate(steps):
+        now *= 20 * MS if slow else 1  # so that deadlines pass
+        work = each.do(*step, now)
+        if work is not None:
+            started.setdefault(id(work), work)
+        for entity in each.entities:
+            numbers = [work.args[0] for work in started.values() if work.entity is entity]
+            assert numbers == sorted(numbers)
+            assert not entity.depth or len(entity.waiting) <= entity.depth
+    while engine.idle_workers and (work := engine.dispatch(0, now)) is not None:
+        engine.finished(work, now, now, now, 0, work.worker)
+    if engine.idle_workers == engine.n_workers and max(engine._state.group_owner) < 0:
+        assert not any(entity.waiting for entity in each.entities)
 
 
 def busy_engine():
@@ -529,12 +540,12 @@ def busy_engine():
     Return an engine in which something of each kind is under way.
 
     One of group 0 runs and one waits for it; one holds the GIL and one is held back; one is
-    suspended; a job of a DAG is ready; and one entry is stale.
+    suspended; and a job of a DAG is ready.
     """
-    twin = Twin('rad', 4)
+    twin = Steps('rad', 4)
     for step, *several in [
             ('ready', 0), ('dispatch', 0), ('suspend', 0), ('ready', 2, 1, 3, 3),
-            ('dispatch', 0, 0, 0), ('ready', 0, 0), ('remove', 0), ('ready', 4)]:
+            ('dispatch', 0, 0, 0), ('ready', 0, 0, 4)]:
         for which in several:
             twin.do(step, which, 0)
     return twin.engine
@@ -549,11 +560,38 @@ def set_running(engine, column, value):
     getattr(engine._state, column)[engine._state.group_owner[0]] = value
 
 
+def set_queue(engine, column, value):
+    """Change what is known of a queue in which two wait."""
+    state = engine._state
+    queue = next(queue for queue, first in enumerate(state.queue_first)
+                 if state.queue_last[queue] != first)
+    getattr(state, column)[queue] = value(state, queue)
+
+
+def set_key(engine, queue):
+    """Let a queue at the end of the ready heap come last."""
+    state = engine._state
+    state.ready[-1] = state.queue_key[queue] = (10 ** 12, 0, 0, 0, queue)
+
+
 BREAKS = {
-    'lost': ('in no queue', lambda e: e._state.held_back.pop()),
+    'lost entry': ('those in a heap', lambda e: e._state.held_back.pop()),
+    'two entries': ('a second entry', lambda e: e._state.ready.append(e._state.ready[0])),
+    'wrong place': ('which says', lambda e: set_queue(e, 'queue_place', lambda s, q: 7)),
+    'wrong key': ('which says', lambda e: set_queue(e, 'queue_key', lambda s, q: (0,) * 5)),
+    'lost first': ('backwards', lambda e: set_queue(
+        e, 'queue_first', lambda s, q: s.x_next[s.queue_first[q]])),
+    'lost last': ('backwards', lambda e: set_queue(
+        e, 'queue_last', lambda s, q: s.queue_first[q])),
+    'order in a queue': ('is before', lambda e: set_queue(
+        e, 'queue_first', lambda s, q: s.x_key.__setitem__(
+            s.queue_first[q], (10 ** 12,) * 5) or s.queue_first[q])),
+    'after its first': ('is not late', lambda e: set_key(e, e._state.ready[-1][4])),
+    'late and empty': ('is empty', lambda e: e._state.queue_demoted.append(7)
+                       or e._state.queue_first.append(-1) or e._state.queue_last.append(-1)
+                       or e._state.queue_place.append(-1)),
     'wrong group': ('waits for group', lambda e: e._state.x_group.__setitem__(
-        e._state.group_heap[0][0][4], -1)),
-    'stale': ('are stale', lambda e: count(e, N_STALE)),
+        e._state.queue_first[e._state.group_heap[0][0][4]], -1)),
     'idle workers': ('are idle', lambda e: count(e, N_IDLE)),
     'holders counted': ('hold the interpreter', lambda e: count(e, N_HOLDING)),
     'worker': ('runs execution', lambda e: set_running(e, 'x_state', WAITING)),
@@ -561,8 +599,8 @@ BREAKS = {
     'active': ('counted are', lambda e: e._state.job_active.__setitem__(
         e._state.job_dag.index(0), 9)),
     'open jobs': ('jobs of DAG 0 are open', lambda e: e._state.n_open.__setitem__(0, 0)),
-    'deadline': ('next deadline', lambda e: setattr(e.deadlines, 'next', 5)),
     'bypass': ('bypass the core', lambda e: setattr(e, '_is_bypassed', True)),
+    'deadline': ('next deadline', lambda e: setattr(e.deadlines, 'next', 5)),
 }
 
 
@@ -581,6 +619,6 @@ def test_a_broken_invariant_ends_the_spin(make_executor, make_node):
     executor = make_executor(nodes=[node])
     with Spinning(executor, raises=InvariantError) as spinning:
         assert wait_for(lambda: ticks)
-        count(executor._engine, N_STALE)
+        count(executor._engine, N_HOLDING)
         spinning.join()
-        executor._engine._state.scalars[N_STALE] -= 1
+        executor._engine._state.scalars[N_HOLDING] -= 1
