@@ -103,9 +103,13 @@ def test_commands_and_options_exist(page):
         assert used - known_options(words) - {'--help'} == set(), line
 
 
-def test_every_verb_is_on_the_page_of_commands():
+def test_the_page_of_commands_has_the_groups_of_the_help():
     text = (TOP / 'docs' / 'commands.md').read_text(encoding='utf-8')
-    assert not [verb for verb in program.VERBS if not re.search(rf'`mddag {verb}[ `]', text)]
+    groups = {title: re.findall(r'^\* `mddag ((?:(?:graph|import) )?[a-z-]+)', part, re.MULTILINE)
+              for title, part in re.findall(r'^### \[(\w+)\]\S+\n(.*?)(?=^##)', text,
+                                            re.MULTILINE | re.DOTALL)}
+    assert {title: sorted(verbs) for title, verbs in groups.items()} == {
+        title: sorted(verbs) for title, verbs in program.TASKS.items()}
 
 
 def test_pages_of_reference_are_complete(tmp_path):
