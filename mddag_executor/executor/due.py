@@ -133,7 +133,9 @@ class DueTimes:
         """Return the next due time, or that of a look, and the same of timers only."""
         engine, check = self._engine, self._gil_check
         timer = self._timers.next_look() if looks else self._timers.next_due()
-        first = min(timer, self.deadline - self._offset + 1) if self.deadline < NEVER else timer
+        first = timer
+        if self.deadline < NEVER:  # a miss need not be reported at once while callbacks compute
+            first = min(first, self.deadline - self._offset + (NET_NS if looks else 1))
         if self._calls:
             first = min(first, self._calls[0][0])
         if engine.holders and engine.has_waiting:
@@ -149,7 +151,10 @@ class DueTimes:
         """Return how long an arrival at an entity may stay unnoticed while a callback computes."""
         if entity.is_eager():
             return 0
-        return min(period, self._engine.relative_deadline(entity)) // LOOK_PART
+        deadline = self._engine.relative_deadline(entity)
+        if entity.callback is not None:  # each release counts
+            deadline = min(period, deadline)
+        return deadline // LOOK_PART
 
     def expect(self, entity: Entity) -> None:
         """Note that something may arrive at an entity from outside."""
@@ -165,7 +170,8 @@ class DueTimes:
     def look_after(self, now: int) -> None:
         """Set the time of a look in case that a short callback runs longer than expected."""
         watch = self._watch
-        at = min(self._timers.next_look(), now + NET_NS)
+        at = min(self._timers.next_look(), now + (
+            self._engine.patience() if self._engine.has_waiting else NET_NS))
         if at < watch.at or watch.at < now + GUARD_NS:
             watch.arm(at)
 

@@ -59,7 +59,7 @@ WAITS = 0.5
 FIRST_RUNS = 3
 """The first executions (loading, JIT, page faults) say little about the usual time."""
 SHORT_NS = 2_000
-"""A callback that usually computes for less than half of this is not worth ordering."""
+"""A callback that computes for less than this is never inconclusive."""
 LATELY = 8
 """
 Averages cover about this many executions.
@@ -88,7 +88,7 @@ class GilHabit:
     Whether one callback holds the GIL while it runs.
 
     :param declared: the declared value; None: it is measured.
-    :ivar holds: 1 or 0, for its next execution; ``computes``: the same, also if it is short.
+    :ivar holds: 1 or 0, for its next execution; ``computes``: the same, unless that is a trial.
     :ivar mean_ns: recent average of its executions' CPU time.
     :ivar needs_ns: how long it takes when nothing disturbs it: ``mean_ns`` or, unless it computes,
         the least duration of recent executions if that is longer.  The first ``FIRST_RUNS`` do not
@@ -171,9 +171,7 @@ class GilHabit:
         share = self.share
         self.share = part if share is None else share + (part - share) / self._runs
         self.is_known = True
-        least, short = (WAITS, SHORT_NS // 2) if usual else (COMPUTES, 2 * SHORT_NS)
-        self.computes = int(self.share >= least)
-        self.holds = int(self.computes and self.mean_ns >= short)
+        self.holds = self.computes = int(self.share >= (WAITS if usual else COMPUTES))
 
 
 class Measurement:

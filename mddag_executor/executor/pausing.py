@@ -17,7 +17,9 @@ tools use all of its identifiers, the two share the GIL.
 2.  It pauses in code of the user's own only: never in this package, in rclpy or in Python's
     library, which may own locks that others need at once.
 3.  A callback may pause while it owns a lock that the urgent one needs.  So the paused thread
-    checks every ``CHECK_S`` whether the urgent one computes; if not, it goes on.
+    checks every ``CHECK_S`` whether the urgent one computes.  If that got no CPU since the last
+    check, and is asleep, the paused one goes on.  (A thread that waits for the GIL wakes up
+    every switch interval; one that waits for a CPU is not asleep.)
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import mddag_executor
-from mddag_executor.executor.gil import cpu_ns
+from mddag_executor.executor.gil import cpu_ns, schedule_of
 import rclpy
 
 PAUSES_BY_S = 0.001
@@ -48,20 +50,22 @@ class Pause:
     """
     One pause of a thread; all methods but ``wait_for_it`` and ``take`` need the engine's lock.
 
-    :param ident: of the thread; ``urgent``: of the thread of the callback that overtakes it.
+    :param thread: the ``WorkerThread`` that pauses.
+    :param urgent: that of the callback that overtakes it, or of another one after that.
     """
 
-    __slots__ = ('ident', '_urgent', '_may_go_on', '_has_begun', '_codes', '_is_taken')
+    __slots__ = ('_thread', 'ident', 'urgent', '_may_go_on', '_has_begun', '_codes', '_is_taken')
 
-    def __init__(self, ident: int, urgent: int) -> None:
-        self.ident = ident
-        self._urgent = urgent
+    def __init__(self, thread: Any, urgent: Any) -> None:
+        self._thread = thread
+        self.ident = thread.ident
+        self.urgent = urgent
         self._may_go_on = threading.Lock()
         self._may_go_on.acquire()
         self._has_begun = threading.Lock()
         self._has_begun.acquire()
         self._is_taken = False
-        self._codes = [*_own_code(sys._current_frames().get(ident))]
+        self._codes = [*_own_code(sys._current_frames().get(self.ident))]
         if self._codes:
             _monitor.begin(self, self._codes)
 
@@ -76,13 +80,27 @@ class Pause:
             return
         self._is_taken = True
         _monitor.end(self, self._codes)
+        measurement = self._thread.measurement
+        if measurement is not None:
+            measurement.pause()
+        begun = monotonic_ns()
         self._has_begun.release()
-        at, own = monotonic_ns(), cpu_ns(self._urgent)
+        self._wait()
+        self._thread.paused_ns += monotonic_ns() - begun
+        if measurement is not None:
+            measurement.resume()
+
+    def _wait(self) -> None:
+        own, slept = cpu_ns(self.urgent.ident), -2
         while not self._may_go_on.acquire(timeout=CHECK_S):
-            before, at, own_before = at, monotonic_ns(), own
-            own = cpu_ns(self._urgent)
-            if 20 * (own - own_before) < at - before:
+            before, own = own, cpu_ns(self.urgent.ident)
+            if own > before:
+                slept = -2
+                continue
+            schedule = schedule_of(self.urgent.vtid)
+            if schedule.is_asleep and schedule.slices in (slept, -1):
                 return  # it may wait for a lock of this one
+            slept = schedule.slices
 
     def end(self) -> None:
         """Let the thread go on."""

@@ -131,6 +131,7 @@ class WorkerThread:
     :ivar has_lent: whether its callback has returned its worker at any time; ``is_out``: whether
         it has none now; ``waits``: whether it still waits for what it lent its worker for.
     :ivar measurement: of its running callback; None: it is not measured.
+    :ivar paused_ns: for how long the running callback has paused.
     :ivar pause: the pause of the callback that it has just overtaken.
     :ivar waits_since: since when it has waited in the epoll, on the trace's clock.
     :ivar is_spare: whether its last callback has left the events to another thread.
@@ -143,7 +144,7 @@ class WorkerThread:
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
                  'state', 'is_spare', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
-                 'waits_since', 'is_out', 'measurement', 'pause')
+                 'waits_since', 'is_out', 'measurement', 'pause', 'paused_ns')
 
     def __init__(self, pool: WorkerPool, thread: threading.Thread | None) -> None:
         self.pool = pool
@@ -159,7 +160,7 @@ class WorkerThread:
         self.pause: Pause | None = None
         self.is_spare = False
         self.state = ThreadState.RUNNING if thread is None else ThreadState.PARKED
-        self.published = self.start = self.end = self.waits_since = 0
+        self.published = self.start = self.end = self.waits_since = self.paused_ns = 0
         self.outcome: Any = None
 
     def begin(self) -> None:
@@ -380,7 +381,8 @@ class WorkerPool:
 
     def note_eager(self, entity: Entity) -> None:
         """Note whether a thread must wait for an entity's messages or requests, at any time."""
-        is_eager = entity.is_eager() and entity.kind in (SUBSCRIPTION, SERVICE)
+        is_eager = entity.kind in (SUBSCRIPTION, SERVICE) and (
+            entity.may_come_from_outside() and entity.is_eager())
         if is_eager != entity.counts_as_eager:
             with self.lock:
                 if is_eager != entity.counts_as_eager and not entity.removed:
@@ -642,8 +644,6 @@ class WorkerPool:
                         engine.ask_again()
                 else:
                     self._report_unusual_end(me, work, now)
-                if self._pauses:
-                    self.end_pauses()
                 if work.entity.removed:
                     self.wake_executor()  # the registry can forget it now
                 if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:
@@ -652,6 +652,8 @@ class WorkerPool:
                 self.due.arm(now - self._offset)
                 self.log_misses()
             found = not is_last and self._choose(me, self.now)
+            if self._pauses:
+                self.end_pauses()
         if self.deferred:
             self._do_deferred()
         return found
@@ -717,10 +719,10 @@ class WorkerPool:
                     or engine.deadlines.next < due.deadline):
                 due.arm(now - self._offset)
         elif engine.idle_workers:
-            if me.is_spare or self._eager and not is_short or engine.may_start_more(now):
-                self._call()
-            elif is_short:
+            if is_short:
                 due.look_after(now - self._offset)
+            elif me.is_spare or self._eager or engine.may_start_more(now):
+                self._call()
             else:
                 due.look(now - self._offset)
         return True
@@ -728,8 +730,13 @@ class WorkerPool:
     def _pause(self, overtaken: Work, me: WorkerThread) -> None:
         """Let a callback pause for that of the calling thread; the caller holds the lock."""
         thread = self.thread_of(overtaken)
-        if thread is not None and overtaken not in self._pauses:
-            me.pause = self._pauses[overtaken] = Pause(thread.ident, me.ident)
+        if thread is None:
+            return
+        pause = self._pauses.get(overtaken)
+        if pause is None:
+            me.pause = self._pauses[overtaken] = Pause(thread, me)
+        else:  # the last one has just ended
+            pause.urgent = me
 
     def end_pauses(self) -> None:
         """Let those go on that are overtaken no more; the caller holds the lock."""
@@ -765,7 +772,7 @@ class WorkerPool:
         if habit.rests < 1 or self.engine.record is not None:
             measurement = Measurement(habit)
         me.measurement = measurement
-        me.published = 0
+        me.published = me.paused_ns = 0
         if me.pause is not None:
             pause, me.pause = me.pause, None
             pause.wait_for_it()
@@ -786,11 +793,12 @@ class WorkerPool:
             group.ending_execution(entity.rclpy)
         end = monotonic_ns()
         me.start, me.end = start + self._offset, end + self._offset
+        wall = end - start - me.paused_ns
         if (measurement is None and not me.published
-                and entity.wall_ns <= SHORT_CALLBACK_NS >= end - start):
+                and entity.wall_ns <= SHORT_CALLBACK_NS >= wall):
             habit.rests -= 1  # an average of short executions stays short without it
         else:
-            self._note_times(me, work, measurement, end - start)
+            self._note_times(me, work, measurement, wall)
         if self.callback_ended is not None and me.outcome is None:
             self.callback_ended(entity.rclpy, None)
 
