@@ -91,6 +91,14 @@ def test_english_patterns_find_their_examples(pattern, tmp_path):
     assert len(english.findings(module, tmp_path)) == 2
 
 
+def test_tests_import_helpers_and_not_each_other():
+    found = [f'{path.relative_to(TOP)}: {line}' for path in sorted((TOP / 'test').rglob('*.py'))
+             for line in re.findall(r'^from (?:\.\S*\.|\.+)test_\w+ import .*$',
+                                    path.read_text(encoding='utf-8'), re.MULTILINE)]
+    # Its traces of several processes are being rebuilt; they become a helper then.
+    assert not [line for line in found if '.test_joining import' not in line]
+
+
 def test_copyright():
     assert SOURCES
     assert not [str(path.relative_to(TOP)) for path in SOURCES

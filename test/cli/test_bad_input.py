@@ -9,9 +9,9 @@ from mddag_executor.trace import TraceFile
 import numpy as np
 import pytest
 
+from ..replay.bags import write_bag
 from ..replay.recorded import four_jobs
 from ..replay.test_joining import Trace, TWO
-from ..replay.test_ordinary_bags import write_bag
 from . import golden
 
 GRAPH = """\

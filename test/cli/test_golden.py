@@ -16,7 +16,7 @@ import pytest
 
 from ..replay.recorded import four_jobs, MS, Recorded
 from ..report import runs
-from ..report.test_pictures import GRAPH
+from ..report.drawn import GRAPH
 from ..trace.ctf_session import session
 from . import golden
 

@@ -19,22 +19,7 @@ import pytest
 
 from ..conftest import run_program, wait_for_run
 from . import golden
-
-GRAPH = """\
-mddag: 1
-nodes:
-  - node: /sensor
-    callbacks:
-      - {name: tick, timer: 20ms, dag: main, publishes: [/data], execution_time: 2ms,
-         on_late: continue, max_active_jobs: 900, holds_interpreter: false}
-  - node: /quick
-    callbacks:
-      - {name: cb, subscription: /data, deadline: 500ms, execution_time: 1ms}
-  - node: /slow
-    callbacks:
-      - {name: cb, subscription: /data, deadline: 10ms, execution_time: 15ms}
-paths: [{name: p, callbacks: ['/sensor:tick', '/quick:cb']}]
-"""
+from .declared import GRAPH
 
 
 def test_a_synthetic_run_is_counted_measured_and_recorded(graph, mddag):

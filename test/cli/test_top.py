@@ -20,7 +20,7 @@ from msg_graph import load
 import pytest
 
 from . import golden
-from .test_run import GRAPH
+from .declared import GRAPH
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 EVIL = 'mddag: \x1b]0;owned\x07\x1b[2J[bold]x[/bold]\nrm'

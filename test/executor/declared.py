@@ -130,3 +130,12 @@ class Declared:
         """Let no timer start a job any more."""
         for timer in self.timers:
             timer.cancel()
+
+
+# Two sinks with deadlines of their own, and a chain of two messages to the later one.
+CHAIN = graph(
+    source='name: tick, timer: 20ms, publishes: [/a], dag: chain',
+    middle="""
+        name: relay, subscription: /a, publishes: [/b]
+        name: early, subscription: /a, deadline: 10ms""",
+    sink='name: last, subscription: /b, deadline: 50ms')

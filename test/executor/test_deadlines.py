@@ -14,14 +14,7 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Header
 
 from .conftest import is_idle, matched, Spinning, wait_for
-from .declared import Declared, graph
-
-CHAIN = graph(
-    source='name: tick, timer: 20ms, publishes: [/a], dag: chain',
-    middle="""
-        name: relay, subscription: /a, publishes: [/b]
-        name: early, subscription: /a, deadline: 10ms""",
-    sink='name: last, subscription: /b, deadline: 50ms')
+from .declared import CHAIN, Declared, graph
 
 
 def sinks(executor):

@@ -27,8 +27,7 @@ from rclpy.task import Future
 from std_msgs.msg import Empty, String
 
 from .conftest import Spinning, wait_for
-from .declared import Declared, graph
-from .test_deadlines import CHAIN
+from .declared import CHAIN, Declared, graph
 
 SECOND = 1_000_000_000
 

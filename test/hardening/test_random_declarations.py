@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from ..msg_graph.brute import as_yaml
-from ..msg_graph.test_against_brute_force import declarations
+from ..msg_graph.random_declarations import declarations
 from .verbs import run
 
 EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '60'))

@@ -19,7 +19,7 @@ from mddag_executor.trace.schema import EVENTS
 import pytest
 
 from ..replay.helpers import PATHS, SMALL
-from ..replay.test_fuzz import tell_lies
+from ..replay.lies import tell_lies
 from .verbs import run
 
 EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '32'))

@@ -21,7 +21,7 @@ import pytest
 
 from ..conftest import wait_for_run
 from .conftest import GUESTS, TWO_PROCESSES
-from .test_supervisor import Idle
+from .helpers import Idle
 
 CHAIN = """\
 mddag: 1

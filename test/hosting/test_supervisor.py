@@ -15,6 +15,7 @@ from mddag_executor.hosting.session import Session
 import pytest
 
 from .conftest import has_ended, wait_for
+from .helpers import Idle
 
 # Ready for SIGTERM, a program notes that in a file, whose name replaces MARK; others wait for it.
 WAITS = """
@@ -135,20 +136,6 @@ def test_a_child_does_not_outlive_who_started_it(tmp_path, code):
 
 
 # --- a session -----------------------------------------------------------------------------------
-
-
-class Idle:
-    """An executor that has nothing to run."""
-
-    def __init__(self):
-        self.ended = threading.Event()
-
-    def spin(self):
-        self.ended.wait()
-
-    def shutdown(self, timeout_sec):
-        self.ended.set()
-        return True
 
 
 def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait():

@@ -9,8 +9,7 @@ A case is a text, or what replaces what in files of golden/. UPDATE_GOLDEN: see 
 import json
 import textwrap
 
-import jsonschema
-from msg_graph import GraphError, language, load, loads, yamltext
+from msg_graph import GraphError, load, loads, yamltext
 from msg_graph.caret import read_architecture
 from msg_graph.errors import MOST_ERRORS
 import pytest
@@ -18,11 +17,7 @@ import yaml
 
 from ..cli import golden
 from .helpers import EVERYTHING, GOLDEN, HEAD, write
-
-
-def schema_errors(text):
-    validator = jsonschema.Draft7Validator(language.schema())
-    return [error.message for error in validator.iter_errors(yaml.safe_load(text))]
+from .schema import schema_errors
 
 
 def errors_of(work, *arguments):

@@ -14,7 +14,7 @@ import pytest
 from ..cli import golden
 from ..conftest import examples
 from .helpers import EVERYTHING, GOLDEN, write
-from .test_errors import schema_errors
+from .schema import schema_errors
 
 TOP, SENSOR = ((GOLDEN / f'{name}.yaml').read_text() for name in ('top', 'parts/sensor'))
 

@@ -12,7 +12,7 @@ import yaml
 
 from ..cli import golden
 from .helpers import EVERYTHING, GOLDEN, graph
-from .test_errors import schema_errors
+from .schema import schema_errors
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 SMALL = """\

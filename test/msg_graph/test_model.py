@@ -11,7 +11,7 @@ import yaml
 
 from .brute import all_violations, as_yaml
 from .helpers import graph
-from .test_against_brute_force import declarations
+from .random_declarations import declarations
 
 
 def test_draws_between_the_quantiles():

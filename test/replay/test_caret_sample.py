@@ -3,8 +3,6 @@
 """A real CARET recording, next to CARET's own results: equal to the nanosecond."""
 
 import csv
-import os
-from pathlib import Path
 
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.paths import Paths
@@ -13,11 +11,9 @@ from mddag_executor.trace import import_ctf
 from msg_graph import loads
 import pytest
 
+from .caret import CARET
 from .flows import flows, slow_cases
 
-# not a part of the repository: looked for next to it
-BESIDE = Path(__file__).resolve().parents[3] / 'shared' / 'caret'
-CARET = Path(os.environ.get('MDDAG_CARET_SAMPLE', BESIDE))
 SESSION = CARET / 'end_to_end_sample'
 pytestmark = pytest.mark.skipif(not SESSION.is_dir(), reason='the recording is not there')
 

@@ -13,7 +13,7 @@ from mddag_executor.trace.schema import GOES_ON
 from msg_graph import loads, Process
 import pytest
 
-from ..simulate.test_run import executions
+from ..simulate.helpers import executions
 from .helpers import MS, ns, SMALL, Written
 
 TWO = """\

@@ -16,9 +16,9 @@ from mddag_executor.replay import replay, reschedule
 from msg_graph import load, loads
 import pytest
 
+from .bags import BY_HEADER, write_bag
 from .helpers import Chances, MS, PATHS, SMALL, VirtualRun
 from .recorded import CAMERA, four_jobs
-from .test_ordinary_bags import BY_HEADER, write_bag
 
 TOP = Path(__file__).resolve().parent.parent.parent
 DEMO = TOP / 'bags' / 'demo_short.mcap'

@@ -21,21 +21,9 @@ from mddag_executor.report.text import printable
 import msg_graph
 import pytest
 
+from .drawn import GRAPH
+
 ROOT = Path(__file__).resolve().parents[2]
-GRAPH = """\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {name: t, timer: 10ms, publishes: [/a], dag: one, execution_time: 2ms}
-      - {name: x, subscription: /a, publishes: [/b]}
-      - {name: y, subscription: /a, publishes: [/c], reads: [x]}
-  - node: /m
-    callbacks:
-      - {name: z, sync: [/b, /c], deadline: 50ms}
-      - {name: q, subscription: /a, deadline: 5ms}
-      - {name: s, service: /serve, period: 1s, deadline: 1s, dag: two, reads: [/c]}
-"""
 HOSTILE = ('a"b', 'back\\slash', 'n\\N\\G', '<b>bold</b>', 'line\nbreak', '"]; evil [label="',
            '%% comment', 'end', '--> x', '&quot;', '#35;', '\x1b[31m', '\u202e', '"', '\\')
 

@@ -13,7 +13,7 @@ import msg_graph
 import numpy as np
 import pytest
 
-from ..replay.test_ordinary_bags import BY_HEADER, write_bag
+from ..replay.bags import BY_HEADER, write_bag
 from ..report import runs
 
 

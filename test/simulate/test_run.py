@@ -21,7 +21,6 @@ from mddag_executor.simulate import (
     scale_execution_times,
     Settings,
     simulate,
-    START,
     utilisation,
 )
 from msg_graph import load, loads
@@ -29,6 +28,7 @@ import pytest
 
 from ..conftest import examples
 from ..core.task_sets import Case, cases, declaration
+from .helpers import executions
 
 US = 1_000
 
@@ -223,17 +223,6 @@ def test_the_replayer_counts_the_same(trace, case, horizon, stop):
     if stop:
         stopped = record(case, horizon, trace, judge='completions', stop=True)
         assert replay(trace).result()['duration_ns'] <= stopped.ended_ns
-
-
-def executions(log):
-    """Yield the start of each stretch in which a callback ran, and the entry of its end."""
-    since = {}
-    for entry in log:
-        time, kind, worker, *_ = entry
-        if kind == START:
-            since[worker] = time
-        else:
-            yield since.pop(worker), entry
 
 
 @examples(100)
