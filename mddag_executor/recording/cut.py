@@ -22,7 +22,6 @@ from dataclasses import replace
 
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import (
-    JobNumbers,
     Recording,
     RowNumbers,
 )
@@ -48,21 +47,21 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
             'give an earlier time')
     begin, end = recording.start + begin, recording.start + end
     table, released = recording.executions, recording.releases
-    jobs = JobNumbers(released)
+    jobs, job_of = recording.jobs, recording.job_places
     in_range = (released['release'] >= begin) & (released['release'] < end)
     judged = jobs.marked(in_range)
-    own = judged[jobs.of(table)]
+    own = judged[job_of]
     ends = recording.job_ends
     until = max(
         min(end, recording.end), *(int(times.max(initial=begin)) for times in (
-            table['end'][own], ends['time'][judged[jobs.of(ends)]])))
+            table['end'][own], ends['time'][judged[jobs.places(ends)]])))
     last = max(until, end)      # undeclared callbacks may run after the end of the recording
 
     begun = np.where(table['ready'] >= 0, table['ready'], table['start'])
     begun = np.where(begun >= 0, begun, table['end'])
     kept = own | ((begun < last) & ((table['end'] >= begin) | (table['end'] < 0)))
     seen = judged | jobs.marked((released['release'] >= begin) & (released['release'] < last))
-    seen[jobs.of(table)[kept]] = True
+    seen[job_of[kept]] = True
     seen[-1] = False
     sent, takes = recording.publications, recording.takes
     executions = RowNumbers(kept)
@@ -82,11 +81,11 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
     stops, drops, demotions = recording.stops, recording.drops, recording.demotions
     losses = recording.losses
     return replace(
-        recording, releases=released[seen[jobs.of(released)]], executions=table,
-        publications=sent, takes=takes, job_ends=ends[seen[jobs.of(ends)]],
+        recording, releases=released[seen[jobs.places(released)]], executions=table,
+        publications=sent, takes=takes, job_ends=ends[seen[jobs.places(ends)]],
         stops=stops[(stops['start'] < last) & (stops['end'] > begin)],
         drops=drops[(drops['time'] >= begin) & (drops['time'] < last)],
         losses=losses[(losses['time'] >= begin) & (losses['time'] < last)],
         demotions=demotions[(demotions['time'] >= begin) & (demotions['time'] < last)],
-        misses=recording.misses[judged[jobs.of(recording.misses)]],
+        misses=recording.misses[judged[jobs.places(recording.misses)]],
         start=begin, end=until, judged_releases=(begin, end), whole=recording.whole or recording)

@@ -26,10 +26,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER
-from mddag_executor.recording.columns import rows, Table
+from mddag_executor.recording.columns import in_parts, rows, Table
 import numpy as np
 import numpy.typing as npt
 
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 Ints = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
+Places = npt.NDArray[np.int32]
 
 UNKNOWN = -1
 """A time or number that is not recorded."""
@@ -198,11 +200,20 @@ class Recording:
             return None
         ends, released = self.job_ends, self.releases['release']
         begin, end = self.judged_releases or (-NEVER, NEVER)
-        jobs = JobNumbers(self.releases)
-        judged = jobs.marked((released >= begin) & (released < end))[jobs.of(ends)]
+        judged = self.jobs.marked((released >= begin) & (released < end))[self.jobs.places(ends)]
         dags, counts = np.unique(
             ends['dag'][judged & (ends['reason'] == WITHDRAWN)], return_counts=True)
         return dict(zip(dags.tolist(), counts.tolist()))
+
+    @cached_property
+    def jobs(self) -> Jobs:
+        """Return the jobs."""
+        return Jobs(len(self.task_set.dags), self.releases)
+
+    @cached_property
+    def job_places(self) -> Places:
+        """Return by execution the place of its job in ``jobs``; -1: none."""
+        return self.jobs.places(self.executions)
 
     def callbacks(self) -> tuple[Ints, Ints]:
         """Return the numbers of the callbacks that ran, and by execution the callback's index."""
@@ -250,36 +261,65 @@ class Recording:
         return pandas_frame(self, name)
 
 
-class JobNumbers:
-    """Numbers jobs over all DAGs; the last number is for rows without job."""
+class Jobs:
+    """
+    The jobs of a recording: by DAG, those of a DAG in the order of their releases.
 
-    def __init__(self, released: Table) -> None:
-        self._released = released
-        self._numbers = np.unique(released['job'])
-        self._keys = np.empty(0, dtype=np.int64)
-        self._keys = np.unique(self._key(released['dag'], released['job']))
-        self.none = len(self._keys)
+    A *place* is the position of a job among all jobs, -1 for an unknown job.  It indexes the
+    columns, and any array that has a value for each job (and one more for unknown jobs).
 
-    def of(self, table: Table) -> Ints:
-        """Return the job numbers of rows."""
-        return self.of_jobs(table['dag'], table['job'])
+    :ivar rows: by place the row of ``releases``; ``number``, ``release``: columns of it.
+    :ivar first: by DAG the place of its first job; at the end the number of all jobs.
+    """
 
-    def of_jobs(self, dag: Any, job: Any) -> Ints:
-        """Return the job numbers of DAGs and jobs."""
-        key = self._key(dag, job)
-        at = np.searchsorted(self._keys, key)
-        return np.where((key >= 0) & (np.append(self._keys, UNKNOWN)[at] == key), at, self.none)
+    def __init__(self, n_dags: int, releases: Table) -> None:
+        rows = np.flatnonzero((releases['dag'] >= 0) & (releases['dag'] < n_dags))
+        rows = rows[sort_by(releases['dag'][rows], releases['order'][rows])]
+        self.rows: Ints = rows
+        self.number, self.release, self.noticed, self.order = (
+            releases[name][rows] for name in ('job', 'release', 'noticed', 'order'))
+        self.first: Ints = np.searchsorted(releases['dag'][rows], np.arange(n_dags + 1))
+        # if the jobs of a DAG are numbered one after the other, a place need not be searched for
+        self._searched = [
+            dag for dag in range(n_dags) if (np.diff(self.number[self.of_dag(dag)]) != 1).any()]
+        self._least = np.append(self.number, 0)[self.first[:-1]]
+        self._counts = np.diff(self.first)
+        self._counts[self._searched] = 0
 
-    def _key(self, dag: Any, job: Any) -> Ints:
-        """Return a number for any DAG and job; ``UNKNOWN`` for unknown ones."""
-        dag, at = dag.astype(np.int64), look_up(self._numbers, job)
-        return np.where((dag >= 0) & (at >= 0), dag * len(self._numbers) + at, UNKNOWN)
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def of_dag(self, dag: int) -> slice:
+        """Return the places of the jobs of a DAG."""
+        return slice(int(self.first[dag]), int(self.first[dag + 1]))
+
+    def places(self, table: Table) -> Places:
+        """Return by row the place of its job."""
+        return self.places_of(table['dag'], table['job'])
+
+    def places_of(self, dag: Any, job: Any) -> Places:
+        """Return the places of jobs, by their DAGs and numbers."""
+        found = np.full(len(job), UNKNOWN, dtype=np.int32)
+        if len(self):
+            for part, dags, jobs in zip(*map(in_parts, (found, dag, job))):
+                at = np.where((dags >= 0) & (dags < len(self._counts)), dags, 0)
+                away = jobs - self._least[at]
+                known = (away >= 0) & (away < self._counts[at]) & (at == dags)
+                part[known] = (self.first[at] + away)[known]
+        for each in self._searched:
+            mine, jobs = np.flatnonzero(dag == each), self.of_dag(each)
+            at = look_up(self.number[jobs], job[mine])
+            found[mine] = np.where(at >= 0, at + jobs.start, UNKNOWN)
+        return found
+
+    def rows_of(self, dag: int, job: Any) -> Ints:
+        """Return the positions of jobs among those of their DAG, -1 for unknown jobs."""
+        places = self.places_of(np.broadcast_to(dag, len(job)), job)
+        return np.where(places >= 0, places - self.first[dag], UNKNOWN)
 
     def marked(self, which: Mask) -> Mask:
-        """Return by number whether the job is one of the chosen releases."""
-        found = np.zeros(self.none + 1, dtype=np.bool_)
-        found[self.of(self._released)[which]] = True
-        return found
+        """Return by place whether the job is one of the chosen releases; at the end False."""
+        return np.append(which[self.rows], False)
 
 
 class RowNumbers:

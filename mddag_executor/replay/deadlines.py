@@ -57,8 +57,7 @@ from mddag_executor.recording.columns import concatenate, rows, Table
 from mddag_executor.recording.tables import (
     different,
     Ints,
-    JobNumbers,
-    look_up,
+    Jobs,
     Mask,
     Recording,
     rows_by,
@@ -85,15 +84,17 @@ _ENDS = {
     recorded.FAILED: (FAILED, SINK_FAILED), recorded.OUTDATED: (OUTDATED, SINK_DROPPED)}
 
 
-class Jobs(NamedTuple):
+class JudgedJobs(NamedTuple):
     """
-    The jobs of one DAG, one row each, in the order of their releases.
+    The judged jobs of one DAG, one row each, in the order of their releases.
 
     ``done`` has, by job and vertex, the row of the execution that completed the vertex (-1: none).
     ``ended`` is the position in the order of events at which the job ended early, ``until`` when
     it or the run ended, ns.
     """
 
+    dag: int
+    every: Jobs
     number: Ints
     release: Ints
     released: Ints
@@ -103,7 +104,7 @@ class Jobs(NamedTuple):
 
     def rows_of(self, jobs: Any) -> Ints:
         """Return the rows of jobs; -1 for unknown jobs."""
-        return look_up(self.number, jobs)
+        return self.every.rows_of(self.dag, jobs)
 
 
 class Judged:
@@ -124,15 +125,14 @@ class Judged:
         self._outcomes: list[tuple[int, Ints, Mask]] = []
         #: The first release that is judged.
         self.judge_from = _judge_from(recording, skip)
-        ends, releases = (
-            [table[mine] for mine in rows_by(table['dag'], len(task_set.dags))]
-            for table in (recording.job_ends, recording.releases))
+        ends = [recording.job_ends[mine] for mine in rows_by(
+            recording.job_ends['dag'], len(task_set.dags))]
         completions = _completions(
             recording.executions, len(task_set.dags), recording.links)
-        self.jobs: list[Jobs] = []
+        self.jobs: list[JudgedJobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
-            jobs, verdicts = self._judge(dag, releases[dag], completions.pop(0), ends[dag])
+            jobs, verdicts = self._judge(dag, completions.pop(0), ends[dag])
             self.jobs.append(jobs)
             found += verdicts
         give_back()     # memory of the completions
@@ -150,12 +150,14 @@ class Judged:
     # --- judging ---------------------------------------------------------------------------------
 
     def _judge(
-        self, dag: int, released: Table, completions: Ints, ends: Table
-    ) -> tuple[Jobs, list[Table]]:
-        released = released[sort_by(released['order'])]
+        self, dag: int, completions: Ints, ends: Table
+    ) -> tuple[JudgedJobs, list[Table]]:
         first, last = self.tables.first_vertex[dag:dag + 2]
-        jobs = Jobs(
-            released['job'].copy(), released['release'].copy(), released['order'].copy(),
+        every = self._recording.jobs
+        number, release, released = (
+            each[every.of_dag(dag)] for each in (every.number, every.release, every.order))
+        jobs = JudgedJobs(
+            dag, every, number, release, released,
             np.full((len(released), last - first), -1, dtype=np.int32),
             np.full(len(released), NEVER), np.full(len(released), self._recording.judged_until))
         reason = self._given_up(jobs, ends)
@@ -222,7 +224,7 @@ class Judged:
         self._outcomes.append((dag, outcome, over & judged))
         return jobs, verdicts
 
-    def _dropped(self, jobs: Jobs, sinks: list[int]) -> tuple[Mask, Ints]:
+    def _dropped(self, jobs: JudgedJobs, sinks: list[int]) -> tuple[Mask, Ints]:
         """Return by job and sink whether it was dropped for a newer one, and when."""
         recording = self._recording
         dropped = np.zeros((len(jobs.number), len(sinks)), dtype=np.bool_)
@@ -237,7 +239,7 @@ class Judged:
                 when[row[row >= 0], place] = mine['time'][row >= 0]
         return dropped, when
 
-    def _withheld(self, dag: int, jobs: Jobs, position: Ints) -> Ints:
+    def _withheld(self, dag: int, jobs: JudgedJobs, position: Ints) -> Ints:
         """
         Return by job and vertex the position from which on it is known not to be due (NEVER: due).
 
@@ -249,6 +251,8 @@ class Judged:
             return found
         for v in topological_order(self.task_set.dags[dag]):
             vertex = vertices[v]
+            # a vertex that completed before is not withheld, nor are those that it started
+            found[position[:, v] < found[:, v], v] = NEVER
             for after, topic in optional_edges(vertex, vertices):
                 silent = self._is_silent(first + v, first + after, topic, jobs)
                 silent_from = np.where(silent, position[:, v], NEVER)
@@ -257,7 +261,7 @@ class Judged:
                 np.minimum(found[:, after], found[:, v], out=found[:, after])
         return found
 
-    def _is_silent(self, vertex: int, after: int, topic: str, jobs: Jobs) -> Mask:
+    def _is_silent(self, vertex: int, after: int, topic: str, jobs: JudgedJobs) -> Mask:
         """Return by job whether a vertex did not publish a topic that starts another vertex."""
         recording = self._recording
         if recording.who.every_publisher:
@@ -286,7 +290,7 @@ class Judged:
                 found[vertex, topic] = ran['job'][by[mine]]
         return found
 
-    def _given_up(self, jobs: Jobs, ends: Table) -> Ints:
+    def _given_up(self, jobs: JudgedJobs, ends: Table) -> Ints:
         """Note when jobs ended early; return the reason."""
         reason = np.full(len(jobs.number), -1)
         ends = ends[sort_by(ends['order'])[::-1]]
@@ -299,7 +303,7 @@ class Judged:
             ends[name] for name in ('order', 'time', 'reason'))
         return reason
 
-    def _late_ends(self, jobs: Jobs, ends: Table, ended: Ints) -> None:
+    def _late_ends(self, jobs: JudgedJobs, ends: Table, ended: Ints) -> None:
         """Count ends of jobs that had ended already."""
         if not self._recording.same:
             return
@@ -309,7 +313,7 @@ class Judged:
         was_open = (order > jobs.released[at]) & (order <= ended[at])
         self.contradictions += len(ends) - int(was_open.sum())
 
-    def _expected(self, dag: int, jobs: Jobs) -> Ints | None:
+    def _expected(self, dag: int, jobs: JudgedJobs) -> Ints | None:
         """Return by job and vertex whether it is expected; None: all are expected (rule 5)."""
         changes = [(order, vertices) for order, of, vertices in self._recording.hosted
                    if of == dag]
@@ -324,7 +328,7 @@ class Judged:
         return expected
 
     def _complete(
-        self, dag: int, jobs: Jobs, completing: Ints, expected: Ints | None, position: Ints
+        self, dag: int, jobs: JudgedJobs, completing: Ints, expected: Ints | None, position: Ints
     ) -> tuple[Ints, Ints]:
         """
         Fill in the executions that completed vertices (rule 1), and their positions.
@@ -334,7 +338,8 @@ class Judged:
         """
         first, ran = self.tables.first_vertex[dag], self._recording.executions
         job, order, vertex = (ran[name][completing] for name in ('job', 'order', 'vertex'))
-        row, vertex = jobs.rows_of(job), vertex - first
+        row = self._recording.job_places[completing] - jobs.every.first[dag]
+        vertex = vertex - first
         known = row >= 0
         known[known] = order[known] > jobs.released[row[known]]
         if not known.all():
@@ -366,8 +371,8 @@ class Judged:
         return order[duplicate], row[duplicate]
 
     def _complete_legs(
-        self, jobs: Jobs, mine: Ints, cell: Ints, order: Ints, completing: Ints, n_legs: Ints,
-        duplicate: Mask, orders: Ints,
+        self, jobs: JudgedJobs, mine: Ints, cell: Ints, order: Ints, completing: Ints,
+        n_legs: Ints, duplicate: Mask, orders: Ints,
     ) -> None:
         """Fill in the completions of vertices with several legs."""
         leg = self._recording.executions['leg'][completing[mine]].astype(np.int64)
@@ -406,9 +411,9 @@ class Judged:
         tally = Tally(self.task_set, self.tables)
         demotions = self._recording.demotions
         if self.skip:
-            numbers = JobNumbers(self._recording.releases)
-            kept = numbers.marked(self._recording.releases['release'] >= self.judge_from)
-            demotions = demotions[kept[numbers.of(demotions)]]
+            jobs = self._recording.jobs
+            kept = np.append(jobs.release >= self.judge_from, False)
+            demotions = demotions[kept[jobs.places(demotions)]]
         for dag, outcome, over in self._outcomes:
             tally.jobs[dag] = int(self._is_judged(self.jobs[dag].release).sum())
             for end, n in Counter(outcome[over].tolist()).items():
@@ -453,7 +458,7 @@ class Judged:
 
 
 def _verdicts(
-    dag: int, sinks: list[int], jobs: Jobs, deadline: Ints, completed: Ints, which: Mask,
+    dag: int, sinks: list[int], jobs: JudgedJobs, deadline: Ints, completed: Ints, which: Mask,
     kind: Any, order: Any, until: Any,
 ) -> Table:
     """Return some verdicts, a table of ``VERDICTS``; all columns are by job and sink."""

@@ -54,7 +54,7 @@ from mddag_executor.recording.tables import (
     earliest,
     groups,
     Ints,
-    JobNumbers,
+    Jobs,
     Mask,
     NOTHING,
     Recording,
@@ -188,17 +188,16 @@ class _Part:
         :return: the new numbers of executions.
         """
         found = self.recording
-        jobs = JobNumbers(found.releases)
-        rows = np.full(jobs.none + 1, UNKNOWN)
-        rows[jobs.of(found.releases)] = np.arange(len(found.releases))
+        jobs = Jobs(len(found.task_set.dags), found.releases)
+        rows = np.append(jobs.rows, UNKNOWN)
         table = found.executions
-        row = rows[jobs.of(table)]
+        row = rows[jobs.places(table)]
         kept = (row >= 0) | (table['vertex'] < 0)
         done = np.flatnonzero((table['completes'] != NOTHING) & (row >= 0))
         is_open = self.expected > np.bincount(row[done], np.where(
             table['leg'][done] == ALL_LEGS, legs[table['vertex'][done]], 1),
             minlength=len(self.number))
-        ended = rows[jobs.of(found.job_ends)]
+        ended = rows[jobs.places(found.job_ends)]
         is_open[ended[ended >= 0]] = False
         self.open_jobs = list(zip(
             found.releases['dag'][is_open].tolist(), self.number[is_open].tolist()))
@@ -207,11 +206,11 @@ class _Part:
         table['job'][known] = self.number[row[known]]
         for name in ('job_ends', 'misses', 'demotions'):
             table = getattr(found, name)
-            row = rows[jobs.of(table)]
+            row = rows[jobs.places(table)]
             table['job'] = self.number[row] if len(self.number) else UNKNOWN
             setattr(found, name, table[row >= 0])
         drops = found.drops     # those of unknown jobs are still counted
-        row = rows[jobs.of_jobs(dag_of[drops['vertex']], drops['job'])]
+        row = rows[jobs.places_of(dag_of[drops['vertex']], drops['job'])]
         drops['job'] = np.append(self.number, UNKNOWN)[row]
         new = RowNumbers(kept)
         found.executions = found.executions[kept]

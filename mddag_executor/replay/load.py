@@ -46,7 +46,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.recording import tables as recorded_tables
-from mddag_executor.recording.tables import Ints, look_up, Recording, rows_by, sort_by
+from mddag_executor.recording.tables import Ints, Recording, sort_by
 from mddag_executor.replay.dispatches import dispatch_times
 from mddag_executor.replay.spans import crowded, Spans
 from mddag_executor.replay.usage import ran
@@ -126,15 +126,15 @@ class LoadBuilder:
                             for dag in task_set.dags]
         self._failed: set[tuple[int, int]] = set()
         self._skipped: set[tuple[int, int]] = set()
-        releases = recording.releases[sort_by(recording.releases['order'])]
-        of_dag = [releases[mine] for mine in rows_by(releases['dag'], len(task_set.dags))]
+        jobs = recording.jobs
+        of_dag = [jobs.of_dag(dag.index) for dag in task_set.dags]
         # by DAG: the recorded numbers of its jobs
-        self._numbers = [mine['job'].copy() for mine in of_dag]
+        self._numbers = [jobs.number[mine] for mine in of_dag]
         # by kind of column and DAG: the values of each job, and where they begin
         self._widths = np.array(
             [(1, len(dag.vertices), len(edges)) for dag, edges in zip(
                 task_set.dags, self._publishers)], dtype=np.int64).reshape(-1, 3).T
-        counts = np.array([len(mine) for mine in of_dag], dtype=np.int64)
+        counts = np.diff(jobs.first)
         self._begins = np.cumsum(np.pad(self._widths * counts, ((0, 0), (1, 0))), axis=1)
         # by kind of column and vertex: its place in the first job, and the step to the next job
         dag_of = np.array(tables.dag_of[:tables.n_vertices], dtype=np.int64)
@@ -145,14 +145,13 @@ class LoadBuilder:
             for name, (by, kind) in _COLUMNS.items()}
         for dag, mine in enumerate(of_dag):
             release, noticed = self._of(dag, 'release', 'noticed')
-            release[:] = mine['release']
-            noticed[:] = np.maximum(mine['release'], mine['noticed'])
+            release[:] = jobs.release[mine]
+            noticed[:] = np.maximum(jobs.release[mine], jobs.noticed[mine])
         self._note_ends()
         self._executions = table = recording.executions
         #: By execution the row of its job.
-        self._row = np.full(len(recording.executions), _UNKNOWN)
-        for jobs, rows in zip(self._numbers, rows_by(table['dag'], len(self._numbers))):
-            self._row[rows] = look_up(jobs, table['job'][rows])
+        places = recording.job_places
+        self._row = np.where(places >= 0, places - jobs.first[table['dag']], _UNKNOWN)
         self._note_pieces(n_workers)
         self._note_completions()
         self._note_publications()
@@ -176,9 +175,9 @@ class LoadBuilder:
     def _note_ends(self) -> None:
         """Keep failed and skipped executions: they fail or are skipped again."""
         ends = self._recording.job_ends
-        for dag, jobs in enumerate(self._numbers):
+        for dag in range(len(self._numbers)):
             mine = ends[ends['dag'] == dag]
-            row = look_up(jobs, mine['job'])
+            row = self._recording.jobs.rows_of(dag, mine['job'])
             failed = (row >= 0) & (mine['reason'] == recorded_tables.FAILED)
             self._failed |= set(zip(mine['vertex'][failed].tolist(), row[failed].tolist()))
             skipped = (row >= 0) & (mine['reason'] == recorded_tables.EXPIRED)

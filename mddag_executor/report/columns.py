@@ -75,15 +75,10 @@ def executions(replay: Replay, rows: Ints | None = None) -> tuple[list[Column], 
 
 def _releases(replay: Replay, rows: Ints) -> tuple[Ints, Mask]:
     """Return the releases of the jobs of executions (rows), and which are known."""
-    dags, vertex, job = (
-        replay.recording.executions[name][rows] for name in ('dag', 'vertex', 'job'))
-    release, known = np.zeros(len(rows), dtype=np.int64), np.zeros(len(rows), dtype=np.bool_)
-    for dag, jobs_of in enumerate(replay.judged.jobs):
-        mine = np.flatnonzero((dags == dag) & (vertex >= 0))
-        row = jobs_of.rows_of(job[mine])
-        mine, row = mine[row >= 0], row[row >= 0]
-        release[mine], known[mine] = jobs_of.release[row], True
-    return release, known
+    recording = replay.recording
+    places = recording.job_places[rows]
+    known = (places >= 0) & (recording.executions['vertex'][rows] >= 0)
+    return np.where(known, np.append(recording.jobs.release, 0)[places], 0), known
 
 
 def jobs(replay: Replay) -> list[Column]:

@@ -158,12 +158,25 @@ def check_breakdown(breakdown, sink):
     return sink['completed'] * sum(breakdown['mean'].values())
 
 
+# d runs before b is known to be silent, and before c completes
+EARLY = """\
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: cb, timer: 10ms, publishes: [/a]}]}
+  - {node: /b, callbacks: [{name: cb, subscription: /a, may_publish: [/b]}]}
+  - {node: /c, callbacks: [{name: cb, sync: [/a, /b], publishes: [/c]}]}
+  - {node: /d, callbacks: [{name: cb, subscription: /c, publishes: [/d]}]}
+  - {node: /e, callbacks: [{name: cb, sync: [/a, /d], deadline: 3ms}]}
+"""
+
+
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
        st.sampled_from(['rad', 'fifo', 'rm']), st.integers(1, 25),
        st.sampled_from([0, 70 * MS]), st.lists(st.integers(1, 150), max_size=3, unique=True))
 @examples(40)
 @example(SMALL, 1, 2, 'rad', 8, 0, [])
 @example(SMALL + PATHS, 1, 2, 'rad', 20, 0, [40, 90])
+@example(EARLY, 1, 2, 'fifo', 1, 0, [])
 def test_any_run(text, seed, workers, policy, longest, skip, borders):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'run.mcap')

@@ -8,7 +8,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
 from mddag_executor.recording.columns import rows
-from mddag_executor.recording.tables import JobNumbers, RELEASES
+from mddag_executor.recording.tables import Jobs, RELEASES
 from mddag_executor.replay import replay, ReplayError, reschedule
 from mddag_executor.replay.clocks import offsets
 from mddag_executor.trace import TraceFile
@@ -366,15 +366,16 @@ def test_processes_of_containers_may_have_the_same_numbers(tmp_path, call):
     assert same == apart
 
 
-def test_job_numbers_are_dense():
+def test_places_of_jobs_are_dense():
     """One fast DAG and many slow ones: joining kept an entry for each DAG and each number."""
     dag = np.r_[np.zeros(1000), np.repeat(np.arange(1, 100), 2)].astype(np.int32)
     released = rows(RELEASES, len(dag), dag=dag, job=np.r_[np.arange(1000), np.tile((0, 999), 99)])
-    jobs = JobNumbers(released)
-    assert jobs.none == len(released)
-    assert sorted(jobs.of(released).tolist()) == list(range(len(released)))
+    jobs = Jobs(100, released)
+    assert len(jobs) == len(released)
+    assert sorted(jobs.places(released).tolist()) == list(range(len(released)))
+    assert jobs.rows_of(1, np.array([0, 999, 998])).tolist() == [0, 1, -1]
     unknown = np.array([-1, 1, 100, 0]), np.array([0, 998, 0, 1000])
-    assert jobs.of_jobs(*unknown).tolist() == [jobs.none] * 4
+    assert jobs.places_of(*unknown).tolist() == [-1] * 4
 
 
 def test_machines_are_compared_by_way_of_others_and_by_what_is_given():

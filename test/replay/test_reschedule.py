@@ -292,9 +292,8 @@ def test_what_was_not_published_is_not_published_again(computes, tmp_path, call)
     assert (set(delays[::2]), set(delays[1::2])) == ({DELAY_NS}, {0, NEVER})
 
 
-def test_a_run_without_jobs_is_rescheduled(tmp_path, call):
-    trace = Written(tmp_path / 'run.mcap', TWO, 2).end(20)
-    result = call('replay', trace, '--reschedule', '--json', '-').result
+def test_a_run_without_jobs_is_rescheduled(tmp_path):
+    result = reschedule(Written(tmp_path / 'run.mcap', TWO, 2).end(20)).result()
     assert (result['utilisation'], result['executions']) == (None, 0)
 
 
