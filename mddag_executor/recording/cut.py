@@ -9,10 +9,10 @@ Theory of operation
    all their rows, also later ones, so their verdicts and response times equal those in the whole
    recording.
 2. The part ends when the last of these jobs ended, but not before the end of the range.  Other
-   executions that ended within the part are kept, too, because they may have delayed a job; their
+   executions that ended within the part are also kept, because they may have delayed a job; their
    jobs are not judged.
 3. Rows are not cut.  An execution that began before the range and ended in it is in the part.
-4. What is usual is that of the whole recording (``whole``), not of the part.
+4. Usual times are those of the whole recording (``whole``), not of the part.
 5. Times stay on the clock of the recording; ``start`` becomes the begin of the range.
 """
 

@@ -107,7 +107,7 @@ class Columns:
         return found
 
     def rows(self, kind: np.dtype[Any], which: Any = slice(None)) -> Table:
-        """Return some events as rows of a type, which has a column ``place``, too."""
+        """Return some events as rows of a type, which also has a column ``place``."""
         place = self.place[which]
         return rows(kind, len(place), place=place, **{
             name: self[name][which] for name in kind.names or () if name != 'place'})

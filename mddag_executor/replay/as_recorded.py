@@ -152,7 +152,7 @@ def replay(
 
     :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
     :param span: begin and end of the part to replay, ns after the start; see ``Recording.cut``.
-    :raises mddag_executor.replay.ReplayError: also for an ordinary bag.
+    :raises mddag_executor.replay.ReplayError: if it cannot be replayed, as an ordinary bag.
     """
     recording = open_recording(path, task_set, name, progress)
     if recording.messages is not None:

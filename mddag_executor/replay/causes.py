@@ -34,7 +34,7 @@ The largest part, beyond what is usual, is the cause of the miss.  Two rules pre
 * Waiting during or shortly after a stall of the machine is caused by the backlog.  It counts as
   *machine*, up to the length of the stalls.
 * If all unusual time together is less than the lateness, the usual times are too long for the
-  deadline.  Then they count, too: usual execution times as *ran long*.
+  deadline.  Then they count as well: usual execution times as *ran long*.
 
 A job whose callback raised has *failed*.  A job that expired because of a callback that never ran
 has the cause for which that callback did not run.  A timer's release that was skipped because the

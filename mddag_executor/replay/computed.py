@@ -52,7 +52,7 @@ class ComputedRun(NamedTuple):
     """
     A computed schedule.
 
-    :ivar horizon: no job is released from then on, ns.
+    :ivar horizon: no job is released then or later, ns.
     :ivar end: when it ended, ns; open jobs are then judged if ``judged``.
     :ivar numbers: by DAG the recorded numbers of the load's jobs; None: as in the load.
     :ivar judge_from: jobs released before are not judged; ``judged_releases``: range of judged

@@ -6,7 +6,7 @@ Drafts systems from traces: nodes, callbacks, published topics, rates, execution
 Theory of operation
 -------------------
 1. The tables of the recording have the executions and publications.  Entities of every node
-   (parameter services and the like) are ignored, and nodes without others, too.
+   (parameter services and the like) are ignored, and so are nodes without others.
 2. A coroutine is one execution, however often it was resumed.
 3. A callback in the recorded declaration keeps its name and the declared properties that a trace
    does not show: deadline, queue edges, period, sync, group, name of the DAG.  Other callbacks are
@@ -96,7 +96,7 @@ class System:
         if not self._entities:
             raise InputError(
                 self.name, 'no timer, subscription or service of a node is recorded in it',
-                'record the start of the nodes, too')
+                'also record the start of the nodes')
         # by callback's number
         numbers, index = recording.callbacks()
         self._declared: dict[int, Declared] = {

@@ -122,7 +122,7 @@ class Explanation:
         table, rows = self._executions, self._rows
         on_workers = rows[table['worker'][rows] >= 0]
         start, end = table['start'][on_workers], table['end'][on_workers]
-        # undeclared callbacks may hold the GIL, too: a trace does not say
+        # undeclared callbacks may also hold the GIL: a trace does not say
         holding = rows[(table['holds_gil'][rows] & (table['completes'][rows] > 0))
                        | (table['vertex'][rows] < 0)]
         since, until = table['began'][holding], table['end'][holding]

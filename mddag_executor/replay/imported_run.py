@@ -11,7 +11,7 @@ Executions are linked with messages (``links``), and assigned to jobs (``importe
 1. *Releases.*  A timer is due at t_init + n * period.  rcl keeps this grid even if a timer is more
    than a period late: it skips the missed times.  The release of an execution is the last due time
    at its start.  `rcl_timer_init` is recorded shortly after the timer has read its clock, so an
-   execution that starts up to `_SLACK_NS` before a due time has that release, too, at its start.
+   execution that starts up to `_SLACK_NS` before a due time also has that release, at its start.
    If t_init is unknown, or an earlier execution has the same release (the timer was reset, or
    uses another clock), the release is the start; a warning reports it. A subscription or service
    without publisher in the graph is released as declared: by header stamp, source timestamp, or

@@ -12,8 +12,8 @@ Each trace becomes a recording; their tables are merged in the order of time.
    clock. For other machines the offset is given or estimated from messages (``clocks``), otherwise
    0.
 2. *Numbers.*  Addresses are unique within a process; the number of the trace is added above their
-   48 bits.  Workers are numbered consecutively.  A process or thread id that another trace uses,
-   too (containers, other machines), is replaced by an unused one.
+   48 bits.  Workers are numbered consecutively.  A process or thread id that another trace
+   also uses (containers, other machines) is replaced by an unused one.
 3. *Jobs* are renumbered in the order of their first release.  Releases of two processes belong to
    the same job if they are equal within ``SAME_RELEASE``: releases of a burst are closer, so the
    nearest one counts, of equally near ones the oldest.  If header stamps join the jobs of a DAG,

@@ -21,7 +21,7 @@ Theory of operation
 * If CPU times are recorded, the load has the CPU time and whether the GIL was held (as recorded or
   declared).  An execution that computes without the GIL takes its CPU time: for the rest of the
   time it waited for a CPU.  One that holds the GIL takes its duration without the time in which
-  another callback held the GIL, too; with one worker, or in fewer processes than recorded, it
+  another callback also held the GIL; with one worker, or in fewer processes than recorded, it
   takes its CPU time.  (The difference: other threads of its process computed.)
 * *Transport* is the time from the end of the publishing execution until the successor is ready;
   negative if it published early.

@@ -81,7 +81,7 @@ class Reschedule:
 
     @property
     def _scheduled_ns(self) -> int:
-        """Return how long callbacks are scheduled: a part has jobs of before its begin, too."""
+        """Return how long callbacks are scheduled: a part also has jobs of before its begin."""
         begin = self._run.begin
         return self.settings.duration_ns - min([begin, *self.work.load.times[:1]])
 

@@ -6,7 +6,7 @@ How much time callbacks and workers used: executions, busy time, waiting, CPU ti
 Theory of operation
 -------------------
 1. An execution of a declared callback counts when it completes; its time so far always counts.
-2. A callback uses the whole time of its executions, also if the recording is a part of a longer
+2. A callback uses the whole time of its executions, even if the recording is a part of a longer
    one and they began before it or ended after it.
 3. The workers are busy while they run callbacks, within the span of the recording: each at most
    all of the time.  A callback that another one runs while it waits (an imported one that spins)
