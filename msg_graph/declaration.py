@@ -179,9 +179,13 @@ def _paths(top: Entry, entries: dict[str, Entry]) -> list[Path]:
         entry = Entry(numbered[1], f'path {numbered[0]}', PATH_KEYS)
         name = entry.get('name')
         entry.name = f'path {shown(name)}'
-        path = Path(name, entry.get('callbacks'))
+        path = Path(name, entry.get('callbacks'), entry.get('reaction'), entry.get('age'),
+                    entry.get('tolerate'))
         if entries.setdefault(name, entry) is not entry:
             raise entry.error('name', 'this name is taken', 'give each path a name of its own')
+        if path.tolerate is not None and not path.requirements:
+            raise entry.error('tolerate', 'it has no requirement that could be missed',
+                              "remove 'tolerate:', or add 'reaction:' or 'age:'")
         return path
 
     return for_each(enumerate(top.get('paths'), 1), read_path)

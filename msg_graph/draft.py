@@ -108,11 +108,16 @@ class DraftNode:
 
 @dataclass
 class DraftPath:
-    """A named path: node, subscribed and published topic of each step, or keys of callbacks."""
+    """
+    A named path: node, subscribed and published topic of each step, or keys of callbacks.
+
+    ``also`` has further entries of a path that is declared already.
+    """
 
     name: str
     steps: list[tuple[str, str, str]]
     keys: list[str] = field(default_factory=list)
+    also: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -341,6 +346,7 @@ class _Writer:
                 yield f'  - name: {plain_scalar(path.name)}'
                 yield '    callbacks:'
                 yield from (f"      - '{key}'" for key in keys)
+                yield from (f'    {key}: {value}' for key, value in path.also.items())
             else:
                 chain = ' -> '.join([*path.keys, *(node for node, _, _ in path.steps)])
                 yield printable(f'# {MARK}: path {path.name}: which callbacks? {chain}')

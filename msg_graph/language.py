@@ -515,6 +515,11 @@ PATH_KEYS = {
         f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_USE}')}),
         2, different=True, too_few='give at least 2'),
         "The callbacks along it, each as '/node:callback'.", needed=True),
+    'reaction': Key(time(), 'Maximum reaction time: from a change right after an input of the '
+                    'first callback to the end of the first output that has seen it.'),
+    'age': Key(time(), 'Maximum data age: from the input to the end of each output.'),
+    'tolerate': Key(_WEAKLY_HARD, 'How many inputs or outputs in a row may be late, as '
+                    "'1 of 100'."),
 }
 
 

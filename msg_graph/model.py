@@ -241,10 +241,22 @@ class Path:
 
     :ivar name: unique among the paths.
     :ivar callbacks: keys of the callbacks along it, in the order in which data passes them.
+    :ivar reaction_ns: the required maximum reaction time; None: none is required.
+    :ivar age_ns: the required maximum data age; None: none is required.
+    :ivar tolerate: how many inputs (of the reaction) or outputs (of the age) may be late, or None.
     """
 
     name: str
     callbacks: tuple[str, ...]
+    reaction_ns: int | None = None
+    age_ns: int | None = None
+    tolerate: WeaklyHard | None = None
+
+    @property
+    def requirements(self) -> dict[str, int]:
+        """Return the required times, ns, by 'reaction' and 'age'."""
+        required = {'reaction': self.reaction_ns, 'age': self.age_ns}
+        return {what: time for what, time in required.items() if time is not None}
 
 
 @dataclass(frozen=True, slots=True)

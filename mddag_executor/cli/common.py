@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, cast, TYPE_CHECKING, TypeVar
 
 from mddag_executor import __version__
 from mddag_executor.cli.options import Input, NamedFile, Output, Report
-from mddag_executor.cli.text import is_quiet
+from mddag_executor.cli.text import is_quiet, warn
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.output_rules import (
     check_distinct,
@@ -31,6 +31,7 @@ from mddag_executor.output_rules import (
     remove_results,
     whole_file,
 )
+from mddag_executor.text import listed
 
 if TYPE_CHECKING:
     from mddag_executor.replay.run import Traces
@@ -98,6 +99,14 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     if len(traces) > 1 and (traces[-1] == '-' or is_graph(traces[-1])):
         *traces, args.graph = traces
     args.trace = one_run(traces, args.offset)
+
+
+def leave_out_paths(doing: str, *task_sets: TaskSet) -> None:
+    """Warn that a verb leaves out what is required of paths."""
+    names = [path.name for task_set in task_sets for path in task_set.paths if path.requirements]
+    if names:
+        warn(f'{doing}: the requirements of paths are left out, only deadlines of sinks count: '
+             + listed(names))
 
 
 def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | Traces:

@@ -106,6 +106,7 @@ def _load(paths: Sequence[str]) -> list[TaskSet]:
         for done, path in enumerate(paths):
             line.update(done, f'of {len(paths)} declarations')
             task_sets.append(common.load_graph(path))
+    common.leave_out_paths('evaluate', *task_sets)
     return task_sets
 
 

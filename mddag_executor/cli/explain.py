@@ -52,8 +52,11 @@ def main(args: argparse.Namespace) -> int:
     warn(*outcome.warnings)
     result = outcome.explanation.result(sink, args.job)
     every = sink is None and args.job is None
+    late_paths = outcome.requirements.breakdown() if every else {}
+    if late_paths:
+        result['requirements'] = late_paths
     common.show(args, result, (
-        _lines(outcome) if every else _job_lines(result['jobs'])))
+        _lines(outcome, late_paths) if every else _job_lines(result['jobs'])))
     verdicts.check_judged(outcome.result()['dags'], str(args.trace))
     return 0
 
@@ -84,11 +87,12 @@ def _check_job(job: int, outcome: Replay, sink: int | None) -> None:
                 else ', since no job was released: leave --job out'))
 
 
-def _lines(outcome: Replay) -> Iterator[str]:
+def _lines(outcome: Replay, late_paths: dict[str, Any]) -> Iterator[str]:
     from mddag_executor.report.explained import (
         causes_line,
         causes_table,
         job_lines,
+        paths_tables,
         sinks_table,
         stalls_table,
     )
@@ -104,6 +108,7 @@ def _lines(outcome: Replay) -> Iterator[str]:
         worst = explanation.worst()
         if worst is not None:
             yield from job_lines(worst)
+    yield from paths_tables(late_paths)
     yield verdicts_line(outcome.tally.result()['dags'])
     yield from causes_line(summary)
 

@@ -63,7 +63,8 @@ def main(args: argparse.Namespace) -> int:
     tests = result['tests']
     warn(*_warnings(task_set, result))
     common.show(args, result, (
-        table(_HEADER, _rows(result), grouped=5), *_tests(result), _summary(task_set, result)))
+        table(_HEADER, _rows(result), grouped=5), *_requirements(result), *_tests(result),
+        _summary(task_set, result)))
     return int(args.fail_on_unschedulable and not all(test['holds'] for test in tests))
 
 
@@ -74,10 +75,12 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> dict[str, Any]
     Times are in ns; `rad_offset_ns` is the reference absolute deadline (RAD) minus the release of
     each vertex, in the order of `vertices`. `load` is in cores, `utilisation` is load divided by
     `workers`. They and `critical_path_ns` are None if an execution time is not declared; `tests`
-    is empty then.
+    is empty then. `bound_ns` is the longest reaction time or data age of a path if all sinks are
+    in time; None if nothing bounds it.
     """
     from mddag_executor.core import Tables
     from mddag_executor.laboratory.necessary import necessary_tests
+    from msg_graph.segments import bound
     tables = Tables.build(task_set)
     dags = {}
     for dag in task_set.dags:
@@ -86,6 +89,10 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> dict[str, Any]
         dags[dag.name] = _dag_result(dag, offsets, workers)
     loads = [dag['load'] for dag in dags.values()]
     load = None if None in loads else sum(loads)
+    required = {
+        path.name: {what: {'required_ns': time, 'bound_ns': bound(task_set, path, what)}
+                    for what, time in path.requirements.items()}
+        for path in task_set.paths if path.requirements}
     return {
         'dags': dags,
         'vertices': len(task_set.vertices),
@@ -100,6 +107,7 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> dict[str, Any]
             {'reader': edge.reader, 'topic': edge.topic, 'writers': list(edge.writers)}
             for edge in task_set.queue_edges],
         'paths': {path.name: list(path.callbacks) for path in task_set.paths},
+        **({'requirements': required} if required else {}),
     }
 
 
@@ -161,6 +169,16 @@ def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
             None if load is None else f'{load:.4f}']
         for sink, deadline in dag['sinks'].items():
             yield [*of_dag, short[sink], 'none' if deadline is None else format_ns(deadline)]
+
+
+def _requirements(result: dict[str, Any]) -> Iterator[str]:
+    rows: list[list[Cell]] = [
+        [name, what, format_ns(each['required_ns']),
+         'not bounded' if each['bound_ns'] is None else format_ns(each['bound_ns'])]
+        for name, required in result.get('requirements', {}).items()
+        for what, each in required.items()]
+    if rows:
+        yield table(('path', '', 'required', 'if all sinks are in time'), rows, grouped=1)
 
 
 def _tests(result: dict[str, Any]) -> Iterator[str]:

@@ -66,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
-    from mddag_executor.report.diff import compare_sinks, sinks_table
+    from mddag_executor.report.diff import compare_requirements, compare_sinks, sinks_table
     from mddag_executor.report.replays import (
         recorded_tables,
         summary,
@@ -81,6 +81,8 @@ def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
     elif result['rescheduled']:
         yield 'The recording (A) and the same rescheduled (B):'
         yield sinks_table(compare_sinks(result['recorded']['dags'], result['dags']))
+        if result.get('requirements'):
+            yield sinks_table(compare_requirements(result['recorded'], result), 'path')
     elif result['dags'] or 'recorded_callbacks' not in result:
         yield sink_table(result['dags'])
         yield from times_tables(result['dags'])

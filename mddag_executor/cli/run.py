@@ -135,7 +135,7 @@ def main(args: argparse.Namespace) -> int:
 def _finish(args: argparse.Namespace, result: dict[str, Any], error: BaseException | None) -> int:
     """Show the result; return the exit status, or raise what a node raised."""
     common.show(args, result, live_lines(result))
-    status = verdicts.exit_status(args, result['dags'], result['file'] or 'mddag run')
+    status = verdicts.exit_status(args, result, result['file'] or 'mddag run')
     return _end(error or incomplete(result['trace']) or not_found(args, result), status)
 
 

@@ -115,7 +115,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     common.show(args, result, live_lines(result))
     if any(run.died for run in supervisor.runs):
         return EXIT_DEFECT
-    status = verdicts.exit_status(args, result['dags'], task_set.file)
+    status = verdicts.exit_status(args, result, task_set.file)
     if error := incomplete(*(part['trace'] for part in parts if part is not None)) or not_found(
             args, result):
         raise error

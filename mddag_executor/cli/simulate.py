@@ -50,10 +50,11 @@ def main(args: argparse.Namespace) -> int:
         preemptive=bool(args.preemptive), judge=args.judge,
         stop_at_first_miss=args.stop_at_first_miss, cpus=args.cpus)
     load = periodic_load(task_set, times, args.duration)
+    required = any(path.requirements for path in task_set.paths)
     with Progress('simulating', settings.duration_ns) as line:
         run = simulate(
             task_set, load, settings, utilisation=utilisation(task_set, times, workers),
-            log=args.trace is not None or args.report is not None, progress=line.update)
+            log=bool(args.trace or args.report or required), progress=line.update)
     if args.trace is not None:
         from mddag_executor.replay.run_writer import write_trace
         from mddag_executor.trace.trace_file import whole_trace
@@ -62,12 +63,17 @@ def main(args: argparse.Namespace) -> int:
     if args.report is not None:
         from mddag_executor.report.html import of_run
         common.write_report(args.report, of_run(task_set, load, run))
+    paths: dict[str, Any] = {}
+    if required:
+        from mddag_executor.replay.computed import ComputedRun
+        from mddag_executor.replay.requirements import of_computed
+        paths = of_computed(ComputedRun.of_run(task_set, load, run))
     result = {
-        **run.result(), 'file': task_set.file, 'judge': run.settings.judge,
+        **run.result(), **paths, 'file': task_set.file, 'judge': run.settings.judge,
         'seed': args.seed if args.execution_times is None else None, 'ended_ns': run.ended_ns,
         'trace': args.trace}
     common.show(args, result, _lines(result))
-    return verdicts.exit_status(args, result['dags'], task_set.file, 'simulate for longer')
+    return verdicts.exit_status(args, result, task_set.file, 'simulate for longer')
 
 
 def execution_times(
@@ -90,8 +96,10 @@ def execution_times(
 
 
 def _lines(result: dict[str, Any]) -> Iterator[str]:
-    from mddag_executor.report.tables import run_lines, sink_table
+    from mddag_executor.report.tables import requirement_table, run_lines, sink_table
     yield sink_table(result['dags'])
+    if result.get('requirements'):
+        yield requirement_table(result['requirements'])
     jobs = sum(dag['jobs'] for dag in result['dags'].values())
     yield from run_lines(result, f', {counted(jobs, "job")}')
     if result['ended_ns'] < result['duration_ns']:

@@ -63,6 +63,7 @@ def main(args: argparse.Namespace) -> int:
     common.recording_and_graph(args)
     is_graph = common.is_graph(str(args.trace))
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
+    common.leave_out_paths('slack', task_set)
     callbacks = len(set(problem.callback_of))
     with Progress('searching', callbacks) as line:
         slack = find_slack(problem, line.update, args.parallel or defaults.processors())

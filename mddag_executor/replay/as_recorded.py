@@ -7,6 +7,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
+from mddag_executor.core import NEVER
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import Recording
 from mddag_executor.replay.chains import Chains
@@ -15,6 +16,7 @@ from mddag_executor.replay.deadlines import Judged
 from mddag_executor.replay.drift import drift_of
 from mddag_executor.replay.explain import Explanation
 from mddag_executor.replay.paths import Paths
+from mddag_executor.replay.requirements import Requirements
 from mddag_executor.replay.run import Given, open_recording, Progress
 from mddag_executor.replay.usage import group_waits, share, Usage
 from mddag_executor.text import counted
@@ -67,6 +69,16 @@ class Replay:
         return Explanation(self.recording, self.judged, self.chains)
 
     @cached_property
+    def paths(self) -> Paths:
+        """Return the flows along the declared paths."""
+        return Paths(self.recording, self.judged.judge_from if self.judged.skip else -NEVER)
+
+    @cached_property
+    def requirements(self) -> Requirements:
+        """Return the verdicts about what is required of paths."""
+        return Requirements(self.recording, self.paths, self.judged.judge_from)
+
+    @cached_property
     def _waited(self) -> Any:
         return group_waits(self.recording)
 
@@ -89,7 +101,8 @@ class Replay:
     def result(self) -> dict[str, Any]:
         """Return the result format of ``replay --json``."""
         recording, head, duration = self.recording, self.recording.head, self.duration_ns
-        paths = Paths(recording).results()      # first, because they need the most memory
+        paths = self.paths.results()    # first, because they need the most memory
+        requirements = self.requirements.result()
         result = {
             'policy': head.policy, 'workers': head.workers, 'preemptive': head.preemptive,
             'duration_ns': duration,
@@ -113,7 +126,7 @@ class Replay:
             'dropped': dict(sorted(recording.dropped.items())),
             'messages_lost': recording.messages_lost,
             'misses': self.explanation.summary(),
-            'paths': paths,
+            'paths': paths, **({'requirements': requirements} if requirements else {}),
             **({} if not recording.imported else {
                 'recorded_callbacks': recorded_callbacks(recording),
                 'communications': communications(recording)}),

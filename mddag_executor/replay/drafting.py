@@ -38,7 +38,7 @@ from msg_graph import Callback as Declared
 from msg_graph import ExecutionTime, NO_GRAPH, TaskSet
 from msg_graph.binding import function_of, is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath, leave_out_sources
-from msg_graph.duration import DAY
+from msg_graph.duration import DAY, exact_duration
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
 import numpy as np
 
@@ -188,7 +188,9 @@ class System:
         """Return the declared paths, as far as each step was recorded."""
         every = {c.key: c for node in nodes.values() for c in node.callbacks.values()}
         return [
-            DraftPath(path.name, [], list(path.callbacks))
+            DraftPath(path.name, [], list(path.callbacks), {
+                **{what: exact_duration(time) for what, time in path.requirements.items()},
+                **({} if path.tolerate is None else {'tolerate': str(path.tolerate)})})
             for path in (self.task_set or NO_GRAPH).paths
             if every.keys() >= set(path.callbacks) and all(
                 not {*before.publishes, before.name}.isdisjoint(after.starts + after.reads)

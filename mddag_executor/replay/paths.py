@@ -52,7 +52,7 @@ documentation of its response time cases.
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from mddag_executor.recording.columns import concatenate, rows, Table
 from mddag_executor.recording.tables import (
@@ -68,22 +68,24 @@ from mddag_executor.recording.tables import (
     sort_by,
 )
 from mddag_executor.replay.spread import spread
-from msg_graph import Callback, Path, TaskSet
+from msg_graph import Callback, Path
+from msg_graph.segments import hops
 import numpy as np
 
-HopKind = Literal['trigger', 'topic', 'variable']
 NONE = -1
 _NEVER = 2 ** 62
 _CASES = ('all', 'best', 'worst', 'worst_with_external_latency')
 
 
 STEPS = np.dtype([
-    ('parent', 'i4'), ('position', 'i2'), ('is_run', '?'), ('time', 'i8'), ('end', 'i8')])
+    ('parent', 'i4'), ('position', 'i2'), ('is_run', '?'), ('row', 'i4'), ('time', 'i8'),
+    ('end', 'i8')])
 """
 Columns of a step: its parent's number or -1, its position, whether it is an execution.
 
-``time`` is the start of an execution or the time of a publication (0: not recorded), ``end`` the
-end of an execution (-1: not recorded), ns.
+``row`` is the row of the first piece of an execution (-1: a publication), ``time`` the start of an
+execution or the time of a publication (0: not recorded), ``end`` the end of an execution (-1: not
+recorded), ns.
 """
 
 
@@ -94,13 +96,6 @@ Columns of a publication; -1: unknown.
 ``known``: whether the callback that published it is known; ``run`` is the row of the first piece
 of the execution, ``message`` the number of the message.
 """
-
-
-class Hop(NamedTuple):
-    """How data gets from a callback of a path to the next."""
-
-    kind: HopKind
-    topics: frozenset[str]
 
 
 class Executions(NamedTuple):
@@ -132,18 +127,27 @@ class Flows(NamedTuple):
 
     Times of the first publication (of the first start, if nothing is published), start of the last
     callback's execution, start of the first callback's execution, end of the last one's, ns.
+    ``silent`` is the end of an execution with which the flow ended because it did not publish a
+    topic of ``may_publish``.  ``step`` is the last step.
     """
 
     first: Ints
     arrival: Ints
     begin: Ints
     end: Ints
+    silent: Ints
+    step: Ints
 
 
 class Paths:
-    """The flows along the declared paths of a recording."""
+    """
+    The flows along the declared paths of a recording.
 
-    def __init__(self, recording: Recording) -> None:
+    :param judge_from: earlier inputs are left out of the figures, ns.
+    """
+
+    def __init__(self, recording: Recording, judge_from: int = -_NEVER) -> None:
+        self._judge_from = judge_from
         task_set = recording.task_set
         self._recording, self._task_set = recording, task_set
         self.paths: list[Path] = list(task_set.paths)
@@ -208,10 +212,21 @@ class Paths:
                 continue
             found.append(rows(
                 _SENT, len(ended.rows), known=True, run=self._first(ended.rows), time=ended.time,
-                message=self._message(ended.job, self._vertex[ended.rows], topic)))
+                message=self._message(ended.job, self._vertex[ended.rows], topic)
+                )[self._is_sent(callback, topic, ended)])
         sent = concatenate(found)
         time = sent['time']
         return sent[sort_by(time)] if (time[1:] < time[:-1]).any() else sent
+
+    def _is_sent(self, callback: Callback, topic: int, ended: Ends) -> Mask:
+        """Return in which executions a callback of a computed run published a topic."""
+        sent = np.ones(len(ended.rows), dtype=np.bool_)
+        vertex, vertices = self._vertex[ended.rows], self._task_set.vertices
+        for (before, after), jobs in self._recording.unsent.items():
+            if vertices[before].callback is callback and any(
+                    self._topics.get(t) == topic for t in vertices[after].callback.topics):
+                sent &= (vertex != before) | ~np.isin(ended.job, jobs)
+        return sent
 
     def _recorded(self, callback: Callback, topic: int, mine: Ints) -> Table:
         """Return the recorded publications of a callback among those on a topic."""
@@ -261,7 +276,13 @@ class Paths:
 
     def flows(self, number: int) -> Flows:
         """Return the flows of a path."""
-        return flows_of(self.steps(number), len(self.paths[number].callbacks) - 1)
+        return flows_of(self.steps(number), self.may_end(number))
+
+    def may_end(self, number: int) -> Mask:
+        """Return by position of a path whether a flow may end there, as nothing is published."""
+        return np.array([
+            bool(hop.topics) and hop.topics <= {*self._task_set.callback(key).may_publish}
+            for key, hop in zip(self.paths[number].callbacks, self.hops[number])] + [False])
 
     def steps(self, number: int) -> Table:
         """Return the steps of a path, a table of ``STEPS``."""
@@ -295,7 +316,7 @@ class Paths:
                 mine = at != NONE
                 parent[at[mine]] = _as_of_each(
                     messages, taken[mine], np.full(int(mine.sum()), _NEVER))
-            step = step_of[ran.runs] = steps.add(position, parent, True, ran.start)
+            step = step_of[ran.runs] = steps.add(position, parent, ran.start, ran.runs)
             topics = [self._topics[t] for t in path_hops[position].topics] \
                 if position < len(path_hops) else []
             before = self._done(steps, callback, ended, step_of), _Timeline(
@@ -352,7 +373,7 @@ class Paths:
         parent = np.where(known & (run != NONE), step_of[run], NONE)
         latest = (parent == NONE) & ((callback.kind == 'sync') | ~known)
         parent[latest] = ran.as_of(time[latest], before=True)
-        made = steps.add(position, parent, False, time)
+        made = steps.add(position, parent, time)
         there = (made != NONE) & (message != NONE)
         return _Timeline(time, made), np.column_stack((message, time, made))[there]
 
@@ -369,10 +390,12 @@ class Paths:
         found = {}
         for number, (path, path_hops) in enumerate(zip(self.paths, self.hops)):
             flows = self.flows(number)
+            judged = flows.begin >= self._judge_from if self._judge_from > -_NEVER else slice(None)
+            first, arrival, begin, end = (each[judged] for each in flows[:4])
             found[path.name] = {
                 'callbacks': list(path.callbacks), 'hops': [hop.kind for hop in path_hops],
-                'flows': len(flows.arrival), 'arrived': int((flows.arrival != NONE).sum()),
-                **figures(flows.first, flows.arrival), 'whole': figures(flows.begin, flows.end)}
+                'flows': len(arrival), 'arrived': int((arrival != NONE).sum()),
+                **figures(first, arrival), 'whole': figures(begin, end)}
         return found
 
 
@@ -398,12 +421,19 @@ class _Steps:
         self._parts = [rows(STEPS)]
         self._count = 0
 
-    def add(self, position: int, parent: Ints, is_run: bool, times: Ints) -> Ints:
-        """Add steps that have a parent, or begin the path; return their numbers."""
+    def add(
+        self, position: int, parent: Ints, times: Ints, runs: Ints | None = None
+    ) -> Ints:
+        """
+        Add steps that have a parent, or begin the path; return their numbers.
+
+        :param runs: the rows of executions; None: they are publications.
+        """
         wanted = (parent != NONE) | (position == 0)
         numbers = np.where(wanted, self._count + np.cumsum(wanted) - 1, NONE)
         self._parts.append(rows(
-            STEPS, int(wanted.sum()), parent=parent[wanted], position=position, is_run=is_run,
+            STEPS, int(wanted.sum()), parent=parent[wanted], position=position,
+            is_run=runs is not None, row=NONE if runs is None else runs[wanted],
             time=times[wanted], end=NONE))
         self._count += len(self._parts[-1])
         return numbers
@@ -436,11 +466,20 @@ def leaves(steps: Table, last: int) -> Ints:
     return np.flatnonzero(~inner & ~dead)
 
 
-def flows_of(steps: Table, last: int) -> Flows:
-    """Return the flows: the branches from steps without a parent to those without children."""
+def flows_of(steps: Table, may_end: Mask) -> Flows:
+    """
+    Return the flows: the branches from steps without a parent to those without children.
+
+    :param may_end: by position whether a flow may end there, as nothing is published.
+    """
+    last = len(may_end) - 1
     step = leaves(steps, last)
-    found = Flows(*(np.full(len(step), NONE) for _ in Flows._fields))
+    first, arrival, begin, end, silent_end = (np.full(len(step), NONE) for _ in range(5))
+    found = Flows(first, arrival, begin, end, silent_end, step)
     flow = np.arange(len(step))
+    ends = steps[step]
+    silent = may_end[ends['position']] & ends['is_run'] & (ends['end'] != NONE)
+    found.silent[silent] = ends['end'][silent]
     while len(step):
         of = steps[step]
         run, begin, at_last = of['is_run'], of['position'] == 0, of['position'] == last
@@ -513,18 +552,3 @@ def _as_of_each(messages: Ints, wanted: Any, times: Ints) -> Ints:
     found = np.full(len(wanted), NONE)
     found[order[good] - n] = messages[order[last[good]], 2]
     return found
-
-
-def hops(task_set: TaskSet, path: Path) -> list[Hop]:
-    """Return how data gets from each callback of a path to the next."""
-    return [_hop(task_set.callback(before), task_set.callback(after))
-            for before, after in zip(path.callbacks, path.callbacks[1:])]
-
-
-def _hop(before: Callback, after: Callback) -> Hop:
-    topics = frozenset(before.publishes).intersection(after.topics)
-    if topics:
-        return Hop('trigger', topics)
-    if before.node == after.node and before.name in after.reads:
-        return Hop('variable', frozenset())
-    return Hop('topic', frozenset(before.publishes).intersection(after.reads))

@@ -25,6 +25,7 @@ from mddag_executor.recording.tables import Recording, UNKNOWN
 from mddag_executor.replay.as_recorded import recording_result, Replay
 from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.load import LoadBuilder, RecordedLoad
+from mddag_executor.replay.requirements import of_computed
 from mddag_executor.replay.run import Given, open_recording, Progress, undeclared
 from mddag_executor.replay.usage import share
 from mddag_executor.simulate import LogEntry, schedule, Settings
@@ -75,6 +76,10 @@ class Reschedule:
                 for w in range(self.settings.workers)]
 
     @property
+    def _requires(self) -> bool:
+        return any(path.requirements for path in self.task_set.paths)
+
+    @property
     def duration_ns(self) -> int:
         """Return the duration of the recording."""
         return max(0, self.settings.duration_ns - self._run.begin)
@@ -101,6 +106,7 @@ class Reschedule:
         if miss is not None:
             dag = self.task_set.dag(miss['dag']).index
             miss = {**miss, 'job': work.jobs[dag][miss['job']]}
+        paths = of_computed(self.computed()) if self._requires else {}
         return {
             'policy': settings.policy, 'on_late': settings.on_late, 'workers': self.workers,
             'preemptive': settings.preemptive,
@@ -122,8 +128,9 @@ class Reschedule:
             'recorded': None if self.recorded is None else {
                 'policy': self.recorded.recording.head.policy,
                 'workers': self.recorded.recording.head.workers,
-                **self.recorded.tally.result()},
-            'recording': recording_result(self._run),
+                **self.recorded.tally.result(),
+                **({'requirements': self.recorded.requirements.result()} if paths else {})},
+            **paths, 'recording': recording_result(self._run),
             **({'notes': self.notes} if self.notes else {}),
             'warnings': self.warnings}
 

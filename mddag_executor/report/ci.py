@@ -4,8 +4,8 @@
 The verdicts of a replay for CI systems: JUnit XML, and annotations of GitHub Actions.
 
 A sink within the tolerance passes; otherwise it fails, with the reason. A sink without due jobs is
-skipped in JUnit XML, and a warning in GitHub's summary. There is one test case per sink; its time
-is the longest response time, in seconds.
+skipped in JUnit XML, and a warning in GitHub's summary. There is one test case per sink, and one
+per requirement of a path; its time is the longest response time, in seconds.
 """
 
 from __future__ import annotations
@@ -23,27 +23,35 @@ Sinks = Mapping[tuple[str, str], str]
 """By DAG and sink why a sink failed."""
 
 
-def junit(result: Mapping[str, Any], broken: Sinks, name: str) -> bytes:
-    """Return JUnit XML of a result of ``replay --json``; ``name`` is that of the recording."""
+def junit(
+    result: Mapping[str, Any], broken: Sinks, late: Sinks, name: str
+) -> bytes:
+    """
+    Return JUnit XML of a result of ``replay --json``.
+
+    :param late: by path and requirement why it is not met.
+    :param name: that of the recording.
+    """
     cases = []
     skipped = 0
-    for dag_name, dag in result['dags'].items():
-        for sink_name, sink in dag['sinks'].items():
-            response, why = sink['response_ns'], broken.get((dag_name, sink_name))
-            case = ElementTree.Element('testcase', {
-                'classname': _text(dag_name), 'name': _text(sink_name),
-                'time': f'{response["max"] / 1e9 if response else 0:.9f}'})
-            if why is not None:
-                ElementTree.SubElement(
-                    case, 'failure', {'message': _text(why), 'type': 'DeadlineMiss'})
-            elif not counts(sink).due:
-                skipped += 1
-                ElementTree.SubElement(case, 'skipped', {'message': _NEVER_DUE})
-            ElementTree.SubElement(case, 'system-out').text = _text(_facts(sink))
-            cases.append(case)
+    for group, each, found, why in _judged(result, broken, late):
+        response = found['response_ns']
+        case = ElementTree.Element('testcase', {
+            'classname': _text(group), 'name': _text(each),
+            'time': f'{response["max"] / 1e9 if response else 0:.9f}'})
+        if why is not None:
+            ElementTree.SubElement(
+                case, 'failure', {'message': _text(why), 'type': 'DeadlineMiss'})
+        elif not counts(found).due:
+            skipped += 1
+            ElementTree.SubElement(case, 'skipped', {'message': _NEVER_DUE})
+        ElementTree.SubElement(case, 'system-out').text = _text(
+            _facts(found, 'deadline' if group in result['dags'] else 'required'))
+        cases.append(case)
     figures = {
         'name': _text(f'mddag replay {name}'), 'tests': str(len(cases)),
-        'failures': str(len(broken)), 'errors': '0', 'time': f'{result["duration_ns"] / 1e9:.9f}'}
+        'failures': str(len(broken) + len(late)), 'errors': '0',
+        'time': f'{result["duration_ns"] / 1e9:.9f}'}
     root = ElementTree.Element('testsuites', figures)
     suite = ElementTree.SubElement(root, 'testsuite', figures, skipped=str(skipped))
     suite.extend(cases)
@@ -52,9 +60,21 @@ def junit(result: Mapping[str, Any], broken: Sinks, name: str) -> bytes:
     return xml + b'\n'
 
 
-def _facts(sink: Mapping[str, Any]) -> str:
+def _judged(
+    result: Mapping[str, Any], broken: Sinks, late: Sinks
+) -> Iterator[tuple[str, str, Mapping[str, Any], str | None]]:
+    """Yield sinks and requirements of paths: group, name, result, and why it failed."""
+    for dag_name, dag in result['dags'].items():
+        for sink_name, sink in dag['sinks'].items():
+            yield dag_name, sink_name, sink, broken.get((dag_name, sink_name))
+    for path, required in result.get('requirements', {}).items():
+        for what, found in required.items():
+            yield f'path {path}', what, found, late.get((path, what))
+
+
+def _facts(sink: Mapping[str, Any], what: str) -> str:
     verdicts, response = counts(sink), sink['response_ns']
-    text = (f'deadline {format_ns(sink["relative_deadline_ns"])}: {verdicts.in_time} of '
+    text = (f'{what} {format_ns(sink["relative_deadline_ns"])}: {verdicts.in_time} of '
             f'{verdicts.due} in time')
     if response:
         text += ', response time ' + ', '.join(
@@ -67,18 +87,19 @@ def _text(text: str) -> str:
     return ''.join(c if c.isprintable() else printable(c) for c in text)
 
 
-def annotation_lines(dags: Mapping[str, Any], broken: Sinks, file: str | None) -> Iterator[str]:
+def annotation_lines(
+    result: Mapping[str, Any], broken: Sinks, late: Sinks, file: str | None
+) -> Iterator[str]:
     """Yield the lines that GitHub Actions shows in its summary; ``file`` is the declaration."""
-    for dag_name, dag in dags.items():
-        for sink_name, sink in dag['sinks'].items():
-            why = broken.get((dag_name, sink_name))
-            if why is not None or not counts(sink).due:
-                properties = {} if file is None else {'file': file}
-                properties['title'] = f'Deadline of {sink_name}'
-                given = ','.join(
-                    f'{name}={_escaped(text, ":,")}' for name, text in properties.items())
-                level = 'warning' if why is None else 'error'
-                yield f'::{level} {given}::{_escaped(_NEVER_DUE if why is None else why)}'
+    for group, each, found, why in _judged(result, broken, late):
+        if why is not None or not counts(found).due:
+            properties = {} if file is None else {'file': file}
+            properties['title'] = (
+                f'Deadline of {each}' if group in result['dags'] else f'{group}: {each}')
+            given = ','.join(
+                f'{name}={_escaped(text, ":,")}' for name, text in properties.items())
+            level = 'warning' if why is None else 'error'
+            yield f'::{level} {given}::{_escaped(_NEVER_DUE if why is None else why)}'
 
 
 def _escaped(text: str, more: str = '') -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mddag_executor.core.requirements import as_dags
 from mddag_executor.core.tally import Counts, counts, total
 from mddag_executor.report.tables import (
     percent,
@@ -38,22 +39,26 @@ def compare(
     :param tolerance: allowed growth of a p99 response time, as a share (0.1 is 10 %).
     :param before: results of ``Replay`` or ``Reschedule``, as is ``after``.
     :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null if missing),
-        ``change_ns`` and ``change`` (share) of response times and ``worse``; ``callbacks`` with
+        ``change_ns`` and ``change`` (share) of response times and ``worse``; ``requirements`` of
+        paths in the same format; ``callbacks`` with
         both sides' executions and mean times; ``worse`` of the whole; ``compared``, the number of
         sinks due in both.
     """
     dags = compare_sinks(before['dags'], after['dags'], tolerance)
+    requirements = compare_requirements(before, after, tolerance)
+    every = [sink for each in (dags, requirements) for dag in each.values()
+             for sink in dag['sinks'].values()]
     took: list[Mapping[str, Any]] = [side.get('callbacks', {}) for side in (before, after)]
     callbacks = {
         key: {'a': _callback(took[0].get(key)), 'b': _callback(took[1].get(key))}
         for key in _union(*took)}
     return {
         'a': _run(before), 'b': _run(after), 'tolerance': tolerance,
-        'worse': any(sink['worse'] for dag in dags.values() for sink in dag['sinks'].values()),
+        'worse': any(sink['worse'] for sink in every),
         'compared': sum(sink['a'] is not None and sink['b'] is not None
-                        and min(sink['a']['due'], sink['b']['due']) > 0
-                        for dag in dags.values() for sink in dag['sinks'].values()),
-        'dags': dags, 'callbacks': callbacks}
+                        and min(sink['a']['due'], sink['b']['due']) > 0 for sink in every),
+        'dags': dags, **({'requirements': requirements} if requirements else {}),
+        'callbacks': callbacks}
 
 
 def compare_sinks(
@@ -115,7 +120,15 @@ def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
     return {key: found[key] for key in ('executions', 'mean_ns', 'longest_ns', 'mean_wait_ns')}
 
 
-def sinks_table(dags: Mapping[str, Any]) -> str:
+def compare_requirements(
+    before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None
+) -> dict[str, Any]:
+    """Compare the requirements of paths in two results; return them as sinks of DAGs."""
+    first, second = (as_dags(side.get('requirements', {})) for side in (before, after))
+    return compare_sinks(first, second, tolerance)
+
+
+def sinks_table(dags: Mapping[str, Any], what: str = 'sink') -> str:
     """Return the table of a difference's sinks; those that are worse in run B come first."""
     sinks = [(name, sink) for dag in dags.values() for name, sink in dag['sinks'].items()]
     short = short_names(name for name, _ in sinks)
@@ -126,7 +139,7 @@ def sinks_table(dags: Mapping[str, Any]) -> str:
         share = None if sink['change'] is None else sink['change']['p99']
         rows.append([short[name], *(cell for pair in pairs for cell in pair),
                      None if share is None else f'{100 * share:+.1f} %', _remark(sink)])
-    return table(_HEADER, rows, marked=[sink['worse'] for _, sink in sinks])
+    return table((what, *_HEADER[1:]), rows, marked=[sink['worse'] for _, sink in sinks])
 
 
 def _cells(side: Mapping[str, Any] | None) -> list[Cell]:
@@ -172,6 +185,9 @@ def callbacks_table(difference: Mapping[str, Any]) -> str:
 def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
     """Yield the tables (callbacks optionally), a line for each run, and the verdict."""
     yield sinks_table(difference['dags'])
+    required = difference.get('requirements', {})
+    if required:
+        yield sinks_table(required, 'path')
     if callbacks:
         yield callbacks_table(difference)
     for mark in ('a', 'b'):
@@ -184,6 +200,7 @@ def lines(difference: Mapping[str, Any], callbacks: bool) -> Iterator[str]:
     if difference['a']['skip_ns']:
         yield ('left out in both: jobs released in the first '
                + format_ns(difference['a']['skip_ns']))
-    n = sum(sink['worse'] for dag in difference['dags'].values()
-            for sink in dag['sinks'].values())
-    yield f'worse in B: {counted(n, "sink")}'
+    worse = [sum(sink['worse'] for dag in dags.values() for sink in dag['sinks'].values())
+             for dags in (difference['dags'], required)]
+    yield f'worse in B: {counted(worse[0], "sink")}' + (
+        f', {counted(worse[1], "requirement")} of paths' if required else '')

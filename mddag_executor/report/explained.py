@@ -52,6 +52,22 @@ def stalls_table(stalls: Sequence[Mapping[str, int]], start: int) -> str:
          stall['misses']] for stall in sorted(longest, key=lambda stall: stall['at_ns'])])
 
 
+def paths_tables(late: Mapping[str, Any]) -> Iterator[str]:
+    """Yield tables of where the time of late reactions and data ages went."""
+    for path, required in late.items():
+        for what, found in required.items():
+            line = f'Path {printable(path)}, {what}: ' + listed([
+                text for n, text in ((found['late'], f'{found["late"]} late'), (
+                    found['unanswered'], f'{found["unanswered"]} without output')) if n])
+            parts = found['parts']
+            yield line + (', on average and in the worst case:' if parts else '')
+            if parts:
+                names = short_names(part['callback'] for part in parts)
+                yield table(('callback', 'what', 'mean', 'worst'), [
+                    [names[part['callback']], part['part'], format_ns(part['mean_ns'], 3),
+                     format_ns(part['worst_ns'], 3)] for part in parts], grouped=1)
+
+
 def job_lines(job: Mapping[str, Any]) -> Iterator[str]:
     """Yield the fate of a job, and the parts of its time."""
     late = job['verdict'] if job['late_ns'] is None else f'late by {format_ns(job["late_ns"], 3)}'

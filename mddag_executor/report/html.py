@@ -14,6 +14,7 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from mddag_executor import __version__
+from mddag_executor.core.requirements import as_dags, not_met
 from mddag_executor.core.tally import total
 from mddag_executor.recording.tables import Ints
 from mddag_executor.replay import Replay, Reschedule
@@ -31,7 +32,14 @@ from mddag_executor.report.html_tables import (
     worst_line,
 )
 from mddag_executor.report.replays import communications_table, PATHS_HEADER, paths_rows
-from mddag_executor.report.tables import never_due_lines, pool_text, ratio, verdicts_line
+from mddag_executor.report.tables import (
+    never_due_lines,
+    pool_text,
+    ratio,
+    requirement_columns,
+    verdicts_line,
+    worst_first,
+)
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import Timeline
 from mddag_executor.simulate import Load, SimulatedRun
@@ -73,8 +81,8 @@ def of_outcome(
 def of_run(task_set: TaskSet, load: Load, run: SimulatedRun) -> ReportData:
     """Return the data of a report about a run that was simulated with its log."""
     replay = Replay(ComputedRun.of_run(task_set, load, run).recording(run.settings.workers))
-    return _data('Simulation', [('declaration', task_set.file)], run.result(), replay,
-                 run.ended_ns)
+    result = {**run.result(), 'requirements': replay.requirements.result()}
+    return _data('Simulation', [('declaration', task_set.file)], result, replay, run.ended_ns)
 
 
 def _data(
@@ -111,6 +119,14 @@ def _page(data: ReportData, misses: Ints) -> Iterator[str]:
     else:
         yield _note('No DAG is declared: give a GRAPH to judge deadlines.')
     yield from _timeline(data, bool(len(misses)))
+    if data.result.get('requirements'):
+        header, cells = requirement_columns(data.result['requirements'])
+        yield '<h2>Requirements of paths</h2>\n' + _note(
+            'A reaction is counted from the change after the input before, an age from the input; '
+            'both up to the end of the last callback.')
+        yield data_table(html_table(
+            header, map(cells, worst_first(as_dags(data.result['requirements']))), 1,
+            {header.index('late')}), name='requirements')
     if data.result.get('paths'):
         yield '<h2>End to end</h2>\n' + _note(
             'From the first publication to the start of the last callback.')
@@ -182,7 +198,8 @@ def _head(data: ReportData) -> Iterator[str]:
         f'<span><b>{escape(printable(word))}</b> {escape(printable(text))}</span>'
         for word, text in data.facts) + '</p>\n'
     if dags:
-        good = every.due and not every.missed
+        good = every.due and not every.missed and not not_met(
+            data.result.get('requirements', {}))
         lines = [*worst_line(data)]
         if data.result.get('misses') is not None:
             lines += causes_line(data.result['misses'])

@@ -16,6 +16,7 @@ Theory of operation
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from colorsys import hls_to_rgb
 from dataclasses import dataclass
 import math
@@ -38,7 +39,8 @@ class Box:
     A vertex; arrows refer to its ``mark``.
 
     :ivar node: the name of its node.
-    :ivar lines: callback, trigger if that is not a topic, a sink's deadline.
+    :ivar lines: callback, trigger if that is not a topic, a sink's deadline, requirements of the
+        paths that end here.
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
     """
 
@@ -90,11 +92,18 @@ def picture(task_set: TaskSet) -> Picture:
     tables = Tables.build(task_set)
     offsets = tables.rad_offset[:len(task_set.vertices)]
     colours = _colours(offsets)
+    ends: dict[str, list[str]] = {}
+    for path in task_set.paths:
+        if path.requirements:
+            ends.setdefault(path.callbacks[-1], []).append(f'path {path.name}: ' + ', '.join(
+                f'{what} {format_ns(time)}' for what, time in path.requirements.items()))
     dags = []
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
-        boxes = tuple(_box(vertex, colours[offset]) for vertex, offset in zip(
-            dag.vertices, offsets[first:first + len(dag.vertices)]))
+        boxes = tuple(
+            _box(vertex, colours[offset], ends.get(vertex.callback.key, ()))
+            for vertex, offset in zip(
+                dag.vertices, offsets[first:first + len(dag.vertices)]))
         dags.append(DagFrame(
             f'd{dag.index}', f'{dag.name}, every {format_ns(dag.period_ns)}', boxes,
             max(path_lengths(dag, [1] * len(boxes)))))
@@ -107,7 +116,7 @@ def _mark(vertex: Vertex) -> str:
     return f'd{vertex.dag}v{vertex.index}'
 
 
-def _box(vertex: Vertex, colour: str) -> Box:
+def _box(vertex: Vertex, colour: str, ends: Iterable[str]) -> Box:
     callback = vertex.callback
     _, several, number = vertex.name[len(callback.key):].partition('#')
     lines = [callback.name + several + number]
@@ -119,6 +128,7 @@ def _box(vertex: Vertex, colour: str) -> Box:
         lines.append(f'service {callback.service}')
     if vertex.deadline_ns is not None:
         lines.append(f'deadline {format_ns(vertex.deadline_ns)}')
+    lines += ends
     return Box(_mark(vertex), callback.node, tuple(lines), callback.kind, colour,
                vertex.deadline_ns is not None)
 

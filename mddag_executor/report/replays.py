@@ -10,6 +10,7 @@ from typing import Any
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.tables import (
     ratio,
+    requirement_table,
     run_lines,
     short_names,
     times,
@@ -102,6 +103,9 @@ def recorded_tables(result: Mapping[str, Any], callbacks: bool) -> Iterator[str]
 
     :param callbacks: also show the callbacks if there are DAGs.
     """
+    if result.get('requirements') and not result.get('recorded'):
+        yield 'End to end, as required; whole paths, to the end of the last callback:'
+        yield requirement_table(result['requirements'])
     if result.get('paths'):
         yield 'End to end, from the first publication to the start of the last callback:'
         yield table(PATHS_HEADER, paths_rows(result['paths']))

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from mddag_executor.core.requirements import as_dags, Requirements
 from mddag_executor.core.tally import Counts, counts, is_kept, never_due, total
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted
@@ -70,6 +71,22 @@ def sink_table(dags: Mapping[str, Any]) -> str:
     return table(('DAG', 'sink', *header),
                  ([sink.dag, sink.shown_name, *cells(sink)] for sink in found),
                  marked=[not is_kept(sink.result) for sink in found], grouped=1)
+
+
+def requirement_table(requirements: Requirements) -> str:
+    """Return a table with a row for each requirement of a path; most misses first."""
+    header, cells = requirement_columns(requirements)
+    found = worst_first(as_dags(requirements))
+    return table(header, map(cells, found), marked=[not is_kept(each.result) for each in found])
+
+
+def requirement_columns(
+    requirements: Requirements
+) -> tuple[list[str], Callable[[Sink], list[Cell]]]:
+    """Return the titles of the columns of requirements, and what gives their cells."""
+    header, cells = sink_columns(as_dags(requirements))
+    return (['path', *(('required' if title == 'deadline' else title) for title in header)],
+            lambda each: [each.name, *cells(each)])
 
 
 def sink_columns(dags: Mapping[str, Any]) -> tuple[list[str], Callable[[Sink], list[Cell]]]:

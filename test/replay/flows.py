@@ -23,7 +23,7 @@ def flows(paths):
         columns = [(None, None)] * (last + 1)
         begin = end = None
         while leaf != -1:
-            parent, position, is_run, time, ended = steps[leaf].item()
+            parent, position, is_run, _, time, ended = steps[leaf].item()
             sent, start = columns[position]
             columns[position] = (sent, time) if is_run else (time, start)
             if is_run and position == last and ended != -1:

@@ -33,7 +33,7 @@ def test_junit_and_annotations_with_hostile_names():
               'workers': 2, 'preemptive': False, 'rescheduled': False, 'warnings': [HOSTILE]}
     broken = not_tolerated(result['dags'])
     assert list(broken) == [(HOSTILE, HOSTILE)]
-    suite = ElementTree.fromstring(junit(result, broken, HOSTILE))[0]
+    suite = ElementTree.fromstring(junit(result, broken, {}, HOSTILE))[0]
     assert {key: suite.attrib[key] for key in ('tests', 'failures', 'errors', 'skipped')} == {
         'tests': '3', 'failures': '1', 'errors': '0', 'skipped': '1'}
     bad, good, none = suite.findall('testcase')
@@ -44,7 +44,7 @@ def test_junit_and_annotations_with_hostile_names():
     assert good.find('failure') is None and good.find('skipped') is None
     assert none.find('skipped') is not None
 
-    bad, none = annotation_lines(result['dags'], broken, 'a,b:c%.yaml')
+    bad, none = annotation_lines(result, broken, {}, 'a,b:c%.yaml')
     assert bad.startswith('::error file=a%2Cb%3Ac%25.yaml,title=Deadline of a"]]><&')
     assert bad.isprintable() and bad.count('::') == 2
     assert bad.endswith('::3 of 3 jobs missed the deadline')
