@@ -16,7 +16,7 @@ other messages are encoded field by field.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import re
 import struct
@@ -192,6 +192,75 @@ def encode(types: Sequence[FieldType], values: Sequence[Any]) -> bytes:
     for kind, value in zip(types, values):
         kind.write(out, value)
     return bytes(out)
+
+
+class Encoder:
+    """
+    Encodes messages of some types; those of equal lengths are packed at once.
+
+    Calling it is `encode`, which takes five times as long.
+    """
+
+    _MOST = 1000        # lengths whose layout is kept
+
+    def __init__(self, types: Sequence[FieldType]) -> None:
+        self._types = types
+        self._pack: dict[tuple[int, ...], Callable[..., bytes]] = {}
+        self._texts = [kind.base == 'string' for kind in types]
+        self._simple = not any(kind.base == 'string' and kind.count is not None for kind in types)
+
+    def __call__(self, values: Sequence[Any]) -> bytes:
+        """Return the message without its encapsulation header."""
+        types = self._types
+        if not self._simple or len(values) != len(types):
+            return encode(types, values)
+        sizes: list[int] = []
+        flat: list[Any] = []
+        for kind, is_text, value in zip(types, self._texts, values):
+            if is_text:
+                text = value.encode('utf-8', 'backslashreplace')
+                sizes.append(len(text))
+                flat += (len(text) + 1, text)
+            elif kind.count is None:
+                flat.append(value)
+            else:
+                sizes.append(len(value))
+                if kind.count < 0:
+                    flat.append(len(value))
+                elif len(value) != kind.count:
+                    raise ValueError(f'{len(value)} values for an array of {kind.count}')
+                flat += value
+        key = tuple(sizes)
+        pack = self._pack.get(key)
+        if pack is None:
+            if len(self._pack) >= self._MOST:
+                self._pack.clear()
+            pack = self._pack[key] = struct.Struct(self._layout(sizes)).pack
+        return pack(*flat)
+
+    def _layout(self, sizes: Sequence[int]) -> str:
+        """Return the struct format of a message with strings and sequences of some lengths."""
+        layout, position, lengths = ['<'], 0, iter(sizes)
+
+        def add(size: int, code: str, count: int = 1) -> None:
+            nonlocal position
+            padding = -position % size
+            layout.append('x' * padding + f'{count}{code}')
+            position += padding + size * count
+
+        for kind in self._types:
+            if kind.base == 'string':
+                count = next(lengths) + 1
+                add(4, 'I')
+                layout.append(f'{count}s')      # a NUL fills it
+                position += count
+                continue
+            count = 1 if kind.count is None else next(lengths)
+            if kind.count is not None and kind.count < 0:
+                add(4, 'I')
+            if count:
+                add(_SIZES[kind.base], _CODES[kind.base], count)
+        return ''.join(layout)
 
 
 def decode(types: Sequence[FieldType], data: bytes) -> tuple[Any, ...]:

@@ -264,8 +264,9 @@ class Trace:
         environment = metadata.environment
         version = tuple(int(environment.get(f'tracer_{part}', '0')[:6]) if environment.get(
             f'tracer_{part}', '0').isdigit() else 0 for part in ('major', 'minor'))
-        # earlier tracers may note the end of a packet before its last events
-        self.ends = version == (0, 0) or version >= (2, 13)
+        #: By how much events may be after the end of their packet: earlier tracers noted it before
+        #: the last events.
+        self.slack = 0 if version == (0, 0) or version >= (2, 13) else metadata.clock.frequency
 
     def ns(self, ticks: int) -> int:
         """Return a time of its clock as ns of the epoch, in the range of times."""
@@ -760,7 +761,9 @@ class _Builder:
                ) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
         """Return the times of events, in ticks, and which are possible."""
         begins = np.array([each.begin for each in self._packets], dtype=np.uint64)
-        ends = np.array([each.end for each in self._packets], dtype=np.uint64)
+        slack = self._decoder.trace.slack
+        ends = np.array([min(each.end + slack, 2 ** 64 - 1) if each.end else 2 ** 64 - 1
+                         for each in self._packets], dtype=np.uint64)
         used = int(self._decoder.short_bits)
         if not used and not bits.any():
             return begins[packet], np.ones(len(packet), dtype=np.bool_)
@@ -779,9 +782,7 @@ class _Builder:
         kept = np.ones(len(ticks), dtype=np.bool_)
         kept[heads + np.arange(len(heads))] = False
         ticks, possible = ticks[kept], possible[kept]
-        if self._decoder.trace.ends:
-            possible &= (ticks <= ends[packet]) | (ends[packet] == 0)
-        return ticks, possible
+        return ticks, possible & (ticks <= ends[packet])
 
 
 def _as_int64(value: Any) -> int:
@@ -862,8 +863,7 @@ class _Stream:
 
     def packets(self, reading: Reading) -> Iterator[Packet]:
         """Yield the packets, in the order of time."""
-        number = discarded = -1
-        begin = 0
+        number, discarded, begin = -1, 0, 0
         for _, file in sorted(self.files):
             size, offset = os.stat(file).st_size, 0
             while offset < size:
@@ -879,10 +879,12 @@ class _Stream:
                     continue        # a snapshot has packets of the one before
                 if 0 <= number < head.number - 1:
                     reading.lost.append(Lost(self._trace.ns(packet.begin), -1))
-                gone = head.discarded - max(discarded, 0)
-                if head.discarded >= 0 and gone:
-                    reading.lost.append(Lost(self._trace.ns(packet.end), max(gone, -1)))
-                number, discarded, begin = head.number, head.discarded, packet.begin
+                # an empty packet, written when a buffer is flushed, may say 0
+                if head.discarded > discarded:
+                    reading.lost.append(Lost(
+                        self._trace.ns(packet.end), head.discarded - discarded))
+                    discarded = head.discarded
+                number, begin = head.number, packet.begin
                 yield packet
                 if head.is_cut:
                     reading.damaged(file, 'the file ends within a packet', size, size)

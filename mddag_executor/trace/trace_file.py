@@ -102,12 +102,12 @@ def _encoder(event: EventType, number: int) -> Callable[..., bytes]:
         packer = struct.Struct('<BQHIQQ4s' + layout)
         return functools.partial(
             packer.pack, Opcode.MESSAGE, packer.size - records.RECORD.size, number)
-    types = event.types
+    encode_fields = cdr.Encoder(event.types)
 
     def encode(sequence: int, log_time: int, publish_time: int, encapsulation: bytes,
                *values: Any) -> bytes:
         head = records.MESSAGE_HEAD.pack(number, sequence, log_time, publish_time)
-        return records.record(Opcode.MESSAGE, head + encapsulation + cdr.encode(types, values))
+        return records.record(Opcode.MESSAGE, head + encapsulation + encode_fields(values))
 
     return encode
 

@@ -175,6 +175,7 @@ class Metadata:
 _TOKEN = re.compile(
     r'/\*.*?\*/|//[^\n]*|\s+|("(?:[^"\\\n]|\\.)*"|:=|\.\.\.|->|[A-Za-z_][A-Za-z0-9_]*'
     r'|[0-9][0-9A-Za-z]*|\S)', re.DOTALL)
+_CONTROL = re.compile(r'[\0-\x08\x0e-\x1f\x7f]')
 _WORD = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
 _NUMBER = re.compile(r'-?(0[xX][0-9a-fA-F]{1,16}|0[bB][01]{1,64}|[0-9]{1,20})[uUlL]{0,3}')
 _ESCAPE = re.compile(r'\\(.)', re.DOTALL)
@@ -193,7 +194,12 @@ def parse_tsdl(data: bytes) -> Metadata:
     """
     if len(data) > _MOST_BYTES:
         raise TsdlError(f'it is larger than {_MOST_BYTES // 2 ** 20} MiB')
-    text = data.decode('utf-8', 'replace')
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        raise TsdlError(f'it is no text at byte {error.start}') from None
+    if _CONTROL.search(text):
+        raise TsdlError('it has control characters')
     return _Parser([token for token in _TOKEN.findall(text) if token]).parse()
 
 

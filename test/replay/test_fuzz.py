@@ -234,17 +234,32 @@ def test_damaged_bags(tmp_path, storage, compression):
             assert bag.warnings or found == whole
 
 
-def test_damaged_ctf_sessions(tmp_path):
-    kinds = [(f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')]
+@pytest.mark.parametrize('head', ['plain', 'compact', 'large'])
+def test_damaged_ctf_sessions(head, tmp_path):
+    """What is cut is missing with a warning; no damage is more than one line."""
+    kinds = [*((f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')),
+             ('my:text', [('label', 'str'), ('values', 'u8[]')])]
     folder = session(tmp_path / 'session', kinds, [
-        (at % 2, at, 1, 1, 'p', 0x5550) for at in range(40)])
+        (at % 3, at * 2 ** 25, 1, 1, 'p', *([0x5550] if at % 3 < 2 else ['label', [1, 2]]))
+        for at in range(60)], head=head, packets=[0, 1, 2])
     files = {name: (folder / name).read_bytes() for name in ('metadata', 'channel_0')}
-    for seed in rounds(20):
+    trace = tmp_path / 'trace.mcap'
+
+    def events():
+        return [event for event in TraceReader(trace).events() if event[0] != 'mddag:lost']
+
+    import_ctf(folder, trace)
+    whole = events()
+    for seed in rounds(100):
         rng = random.Random(seed)
         name = rng.choice(list(files))
         changed = bytearray(files[name])
-        rng.choice((flip, cut, stretch))(changed, rng)
+        mutate = rng.choice((flip, cut, stretch))
+        mutate(changed, rng)
         (folder / name).write_bytes(changed)
-        attempt(folder / name, lambda _: import_ctf(
-            folder, tmp_path / 'trace.mcap', overwrite=True), seed)
+        result = attempt(folder / name, lambda _: import_ctf(folder, trace, overwrite=True), seed)
+        if result is not None and mutate is cut and name == 'channel_0':
+            found = events()
+            assert found == whole[:len(found)]
+            assert result.warnings or len(changed) % (len(files[name]) // 3) == 0
         (folder / name).write_bytes(files[name])

@@ -62,7 +62,8 @@ def session(folder, kinds, events, *, context=True, discarded=0, environment=Non
     :param kinds: names and fields of the events; types are those of `TYPES`, `str`, `TYPE[n]`
         and `TYPE[]`, `text[n]`, or TSDL and a function that returns the bytes
     :param events: place in `kinds`, time since the clock's offset, pid, tid, procname, values
-    :param discarded: events that the tracer says to have discarded in the second of two packets
+    :param discarded: events that the tracer says to have discarded in the second of two packets,
+        or what each packet says
     :param environment: what LTTng writes into the metadata, such as the hostname
     :param boot: the UUID of the clock, which is that of the host's boot
     :param head: of events, of `_HEADS`; ``order``: of bytes, as in `struct`
@@ -85,7 +86,8 @@ def session(folder, kinds, events, *, context=True, discarded=0, environment=Non
     part, data = -(-len(events) // len(packets)), b''
     for place, number in enumerate(packets):
         data += b'' if number < 0 else _packet(
-            kinds, events[place * part:(place + 1) * part], context, discarded * (place > 0),
+            kinds, events[place * part:(place + 1) * part], context,
+            discarded[place] if isinstance(discarded, list) else discarded * (place > 0),
             number, head, order, ids)
     (folder / 'channel_0').write_bytes(data if events else b'')
     return folder

@@ -183,6 +183,16 @@ def test_a_damaged_file_is_used_up_to_the_damage(tmp_path):
         import_ctf(folder, tmp_path / 'out.mcap', overwrite=True)
 
 
+def test_a_count_of_discarded_events_that_goes_back_is_no_gap(tmp_path):
+    """LTTng writes 0 into an empty packet when it flushes a buffer."""
+    folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(8)],
+                     packets=[0, 1, 2, 3], discarded=[2, 5, 0, 7])
+    result = import_ctf(folder, tmp_path / 'out.mcap')
+    assert result.discarded == 7 and 'discarded 7 events: ' in result.warnings[0]
+    assert [event[4] for event in TraceReader(tmp_path / 'out.mcap').events({'mddag:lost'})] == [
+        2, 3, 2]
+
+
 def test_cut_metadata_is_one_error(tmp_path):
     head = struct.pack('<I16sIII5B', 0x75D11D57, b'', 0, 1000 * 8, 4096 * 8, 0, 0, 0, 1, 8)
     for data, what in ((head + bytes(3000), 'is cut or damaged at byte 0'), (head[:20], 'is cut'),
@@ -190,6 +200,41 @@ def test_cut_metadata_is_one_error(tmp_path):
         (tmp_path / 'metadata').write_bytes(data)
         with pytest.raises(TraceError, match=what):
             import_ctf(tmp_path, tmp_path / 'out.mcap')
+
+
+NESTED = 'struct {' * 30 + 'uint32_t a;' + '} a;' * 30
+DOUBLED = ' '.join(f'struct a{n + 1} {{ struct a{n} x; struct a{n} y; }};' for n in range(40))
+
+
+@pytest.mark.parametrize(('types', 'fields', 'says'), [
+    ('', NESTED, 'nested too deep'),
+    (f'struct a0 {{ uint32_t a; }}; {DOUBLED}', 'struct a40 a;', 'more than 5000 members'),
+    (f'struct a0 {{ }}; {DOUBLED}', 'struct a40 a;', 'more than 5000 members'),
+    ('struct a0 { };', 'struct a0 a[4294967295];', 'without a size'),
+    ('', 'uint32_t n; struct { } a[n];', 'without a size'),
+    ('', 'integer { size = 4294967295; } a;', 'no possible size'),
+    ('', 'integer { size = 32; align = 7; } a;', 'no possible alignment'),
+    ('', 'uint32_t a' + '[2]' * 40 + ';', 'not understood'),
+    ('', 'unknown_t a;', 'not understood'), ('', 'uint32_t a; uint32_t a;', 'not understood'),
+    (' ' * 9_000_000, 'uint32_t a;', 'larger than 8 MiB'), ('\0', 'uint32_t a;', 'control char'),
+    ('', 'uint32_t a[999999999];', 'longer than its event'),
+    ('', 'uint32_t a[999999999][999999999];', 'longer than its event'),
+    ('', 'uint32_t n; uint8_t a[n]; uint8_t b[n];', 'longer than its event'),
+    ('', 'uint8_t a[missing];', "no field 'missing'"),
+    ('', 'string a;', 'a text is cut'),
+    ('', 'enum : uint8_t { a = 0 } t; variant <t> { uint8_t a; } v;', 'of an unknown kind'),
+    ('', 'integer { size = 8; align = 4096; } a;', 'an event is cut')])
+def test_hostile_types_are_refused(types, fields, says, tmp_path):
+    """Types, lengths and counts that need more than there is."""
+    folder = session(
+        tmp_path / 's', [('a:b', [('rest', 'u64')])], [(0, 1, 1, 1, 'p', 2**64 - 1)])
+    text = (folder / 'metadata').read_text()
+    text = text.replace('trace {', f'{types}\ntrace {{', 1)
+    text = text.replace('fields := struct {', f'fields := struct {{ {fields} ', 1)
+    (folder / 'metadata').write_text(text.replace(
+        'uint64_t;\n', 'uint64_t;\ntypealias integer { size = 8; } := uint8_t;\n', 1))
+    with pytest.raises(TraceError, match=re.escape(says)):
+        import_ctf(folder, tmp_path / 'out.mcap')
 
 
 _LINE = re.compile(r'\[(\d+)\.(\d{9})\] \(\S+\) (?:\S+ )?([^ ]+): \{.*?vpid = (\d+), '

@@ -236,6 +236,7 @@ def test_any_flat_message_is_as_rosbags_encodes_it(message):
     names, fields = message
     types = [FieldType.parse(name) for name in names]
     data = cdr.ENCAPSULATION + cdr.encode(types, fields)
+    assert cdr.ENCAPSULATION + cdr.Encoder(types)(fields) == data
     decoded = cdr.decode(types, data[4:])
     assert decoded == tuple(fields)
 
