@@ -38,7 +38,7 @@ from msg_graph import loads, NO_GRAPH
 
 if TYPE_CHECKING:
     from mddag_executor.executor.executor import MultiDeadlineExecutor
-    from mddag_executor.executor.statistics import Watch
+    from mddag_executor.executor.watch import Watch
     from mddag_executor.hosting.host import Guest, Host
     from mddag_executor.hosting.loading import Program
     from mddag_executor.hosting.measure import ExecutionPlan, Ledger
@@ -306,7 +306,7 @@ def _run(
 
     :param leave: see ``Host.run``.
     """
-    from mddag_executor.executor.statistics import Watch
+    from mddag_executor.executor.watch import Watch
     from mddag_executor.hosting.session import Session
 
     def end_begins() -> None:

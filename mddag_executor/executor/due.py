@@ -19,11 +19,13 @@ Theory of operation
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from heapq import heappop, heappush
 from time import monotonic_ns, process_time_ns
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
+from mddag_executor.clocks import TraceClock
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
@@ -34,12 +36,54 @@ from mddag_executor.executor.bounds import (
     SOON_NS,
     STOP_NS,
 )
+from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
+from mddag_executor.executor.loop import EventLoop, Parking
 from mddag_executor.executor.shutdown import is_over
+from mddag_executor.executor.timers import TimerQueue
+from mddag_executor.executor.work import Work
 
-if TYPE_CHECKING:
-    from mddag_executor.executor.workers import WorkerPool
+
+class Thread(Protocol):
+    """A thread of the pool."""
+
+    ident: int
+    vtid: int
+
+
+class Clocked(Protocol):
+    """The worker pool, as its due times see it: see ``workers.WorkerPool``."""
+
+    engine: Engine
+    clock: TraceClock
+    loop: EventLoop
+    parking: Parking
+    timers: TimerQueue
+    deferred: deque[Callable[[], None]]
+    running: bool
+    is_stepping: bool
+    polling: int
+    context: Any
+    wake_executor: Callable[[], None]
+
+    def fire_timers(self) -> None:
+        """Report the due timers to the engine."""
+
+    def log_misses(self) -> None:
+        """Log misses, soon."""
+
+    def is_busy(self) -> bool:
+        """Return whether a callback computes."""
+
+    def end_pauses(self) -> None:
+        """Let paused callbacks go on."""
+
+    def waited_since(self, since: int) -> int:
+        """Return since when a thread has waited for events."""
+
+    def thread_of(self, work: Work) -> Thread | None:
+        """Return the thread that runs an execution."""
 
 
 class DueTimes:
@@ -49,7 +93,7 @@ class DueTimes:
     Times are monotonic ns, unless noted otherwise.
     """
 
-    def __init__(self, pool: WorkerPool) -> None:
+    def __init__(self, pool: Clocked) -> None:
         self._pool = pool
         self._engine = pool.engine
         self._timer = pool.loop.timer

@@ -12,18 +12,16 @@ Theory of operation
     the one that collects garbage.  So the parked workers are only told to end, and the last of
     them does the rest.
 3.  Therefore nothing that a thread refers to may refer to the executor: threads would keep it
-    alive.  They have its methods by ``weakly``.
+    alive.  They have its methods by ``weakly.weakly``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import os
 import select
 import sys
 import threading
-from typing import Any, TYPE_CHECKING
-import weakref
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mddag_executor.executor.announcements import Announcements
@@ -34,17 +32,6 @@ if TYPE_CHECKING:
     from mddag_executor.executor.upkeep import Upkeep
     from mddag_executor.executor.waitables import WaitSetThread
     from mddag_executor.executor.workers import WorkerPool
-
-
-def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that calls a method as long as its object is alive, else returns None."""
-    reference = weakref.WeakMethod(method)
-
-    def call(*args: Any) -> Any:
-        living = reference()
-        return None if living is None else living(*args)
-
-    return call
 
 
 class Ending:

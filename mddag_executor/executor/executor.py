@@ -42,7 +42,7 @@ from mddag_executor.executor.compat import (
     TASKS_NEWEST_FIRST,
 )
 from mddag_executor.executor.diagnostics import Diagnostics
-from mddag_executor.executor.ending import Ending, weakly
+from mddag_executor.executor.ending import Ending
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import short_switch_interval
 from mddag_executor.executor.loop import raise_limit
@@ -62,6 +62,7 @@ from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, wa
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.waitables import WaitSetThread
+from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Work
 from mddag_executor.executor.workers import WorkerPool
 from msg_graph import TaskSet

@@ -17,20 +17,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gaps import Gaps
+from mddag_executor.executor.hall import Hall
 from mddag_executor.executor.jobs import Publication, stamped_release
 from mddag_executor.executor.listeners import clear_listener, MANY, set_listener, take_count
 from mddag_executor.executor.loop import ChannelSource, EventLoop
 from mddag_executor.executor.work import Work
 from rclpy.exceptions import InvalidHandle
-
-if TYPE_CHECKING:
-    from mddag_executor.executor.workers import WorkerPool
 
 SERVICE_DEPTH = 10
 """How many requests wait in Python at most: the depth of rclpy's default profile for services."""
@@ -121,7 +119,7 @@ class SubscriptionSource(Source):
     """
 
     def __init__(
-        self, entity: Entity, pool: WorkerPool,
+        self, entity: Entity, pool: Hall,
         publishers: Callable[[Any], frozenset[bytes] | None],
     ) -> None:
         super().__init__(entity, pool.loop, compat.message_taker(entity.rclpy), pool.fail)
@@ -217,7 +215,7 @@ class SubscriptionSource(Source):
 class ServiceSource(Source):
     """A service."""
 
-    def __init__(self, entity: Entity, pool: WorkerPool) -> None:
+    def __init__(self, entity: Entity, pool: Hall) -> None:
         super().__init__(entity, pool.loop, compat.request_taker(entity.rclpy), pool.fail)
         self._pool = pool
 

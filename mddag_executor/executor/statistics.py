@@ -1,15 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""
-Statistics of an executor: a snapshot in plain dictionaries (``statistics_types``), and drift.
-
-The rules of drift are in ``msg_graph.drift``. Their input comes from the executor's counts, and
-the releases from ``Watch``.
-"""
+"""Statistics of an executor: a snapshot in plain dictionaries (``statistics_types``)."""
 
 from __future__ import annotations
 
-from typing import cast, TYPE_CHECKING
+from typing import cast
 
 from mddag_executor.core.tally import counts, never_due
 from mddag_executor.executor.misses import MissNotifier
@@ -17,11 +12,6 @@ from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.statistics_types import CallbackCounts, Statistics, Stops
 from mddag_executor.executor.workers import WorkerPool
-from msg_graph import TaskSet
-from msg_graph.drift import Drift, drift, Observed, Releases
-
-if TYPE_CHECKING:
-    from mddag_executor.executor.executor import MultiDeadlineExecutor
 
 
 def statistics(
@@ -62,38 +52,3 @@ def statistics(
             'path': recorder.path, 'lost': recorder.writer.dropped,
             'error': None if recorder.writer.error is None else str(recorder.writer.error)},
     }
-
-
-class Watch:
-    """Watches an executor from now on."""
-
-    def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
-        self._executor = executor
-        self._task_set = task_set
-        self._now = executor._trace_clock.now
-        self._begin = self._now()
-        self._releases = [Releases() for _ in task_set.dags]
-        executor._engine.verdicts.on_release = self._released
-
-    def _released(self, dag: int, release: int) -> None:
-        if dag < len(self._releases):
-            self._releases[dag].add(release)
-
-    def drift(self, statistics: Statistics) -> list[Drift]:
-        """Return the differences between run and declaration; ``statistics`` are its counts."""
-        return drift(self._task_set, self.observed(statistics))
-
-    def observed(self, statistics: Statistics) -> Observed:
-        """Return the observations; ``statistics`` are the run's counts."""
-        first = min((r.first for r in self._releases if r.count), default=self._begin)
-        counts = statistics['callbacks']
-        sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
-        return Observed(
-            duration_ns=max(0, self._now() - first),
-            releases=dict(zip(sources, self._releases)),
-            got={key: count['ready'] for key, count in counts.items()},
-            ran={key: count['ran'] for key, count in counts.items()},
-            came={**self._executor._registry.came()},
-            publishes={**self._executor._registry.publishes()},
-            nodes={key.rpartition(':')[0] for key in counts},
-            undeclared=self._executor._registry.undeclared())

@@ -21,9 +21,10 @@ callback that ends, and every few milliseconds during a spin.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 import threading
 import types
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol
 
 from mddag_executor.executor.compat import cancel_running
 from mddag_executor.executor.entity import Entity, TIMER
@@ -31,16 +32,34 @@ from mddag_executor.executor.jobs import Origin
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 
-if TYPE_CHECKING:
-    from mddag_executor.executor.workers import WorkerThread
+
+class Runner(Protocol):
+    """The thread that runs a callback: see ``workers.WorkerThread``."""
+
+    work: Work | None
+    pool: Any
+    engine: Any
+
+    @property
+    def job(self) -> tuple[str, int, int] | None:
+        """Return DAG, index and release of its job."""
+
+    def publishes(self, state: Any, msg: Any) -> None:
+        """Note that the callback publishes."""
+
+    def lend(self) -> AbstractContextManager[Any]:
+        """Lend the worker while entered."""
+
+    def is_short(self) -> bool:
+        """Return whether the callback is short."""
 
 
 class _Current(threading.local):
-    running: WorkerThread | None = None
+    running: Runner | None = None
 
 
 current = _Current()
-"""Of the calling thread: ``running``, its ``WorkerThread`` while a callback runs in it."""
+"""Of the calling thread: ``running``, a ``Runner`` while a callback runs in it."""
 
 
 def new_steps(coroutine: Any) -> Any:

@@ -64,24 +64,23 @@ from mddag_executor.executor.bounds import (
 from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN, QuickCallback
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.due import DueTimes
-from mddag_executor.executor.ending import weakly
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION
 from mddag_executor.executor.gil import Measurement
+from mddag_executor.executor.hall import Announced, Spinner
 from mddag_executor.executor.jobs import PublisherState
 from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.pausing import can_pause, Pause
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
+from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Destroyed, Refused, Work
 from mddag_executor.trace.groups import PUBLICATION
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
-    from mddag_executor.executor.announcements import Announcements
     from mddag_executor.executor.coroutines import Loops
-    from mddag_executor.executor.executor import MultiDeadlineExecutor
 
 
 def _nothing() -> None:
@@ -226,7 +225,7 @@ class WorkerPool:
         self.deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.parking = Parking()
-        self.announcements: Announcements | None = None
+        self.announcements: Announced | None = None
         self.timers = TimerQueue(self.loop.wake, fail)
         self.running = False
         self.stopped_at = 0
@@ -243,7 +242,7 @@ class WorkerPool:
         self.context: Any = None
         #: called when entities have changed, or the context has ended
         self.wake_executor: Callable[[], None] = _nothing
-        self._executor: Callable[[], MultiDeadlineExecutor | None] = _nothing
+        self._executor: Callable[[], Spinner | None] = _nothing
         self.fail = fail
         self._miss_log = MissLog(engine.verdicts)
         self._prepare_thread = prepare_thread
@@ -283,14 +282,14 @@ class WorkerPool:
             self._loops.end(
                 [(work.entity.name, work.coroutine) for work in self.engine.begun()])
 
-    def attach(self, executor: MultiDeadlineExecutor) -> None:
+    def attach(self, executor: Spinner) -> None:
         """Set the executor; threads do not keep it alive (``ending``)."""
         self.context = executor.context
         self._executor = weakref.ref(executor)
         self.wake_executor = weakly(executor.wake)
 
     @property
-    def executor(self) -> MultiDeadlineExecutor | None:
+    def executor(self) -> Spinner | None:
         """Return the executor; None: it has been destroyed."""
         return self._executor()
 

@@ -14,8 +14,8 @@ from mddag_executor.core.state import SINK_EXPIRED, SINK_IN_TIME, SINK_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.executor.diagnostics import DagWatch, ERROR, OK, STALE, WARN
 from mddag_executor.executor.settings import Thresholds
-from mddag_executor.executor.statistics import Watch
 from mddag_executor.executor.statistics_types import Statistics
+from mddag_executor.executor.watch import Watch
 from mddag_executor.replay import open_recording
 from mddag_executor.replay.drift import drift_of
 from mddag_executor.report.live_runs import live_lines

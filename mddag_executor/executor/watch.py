@@ -1,0 +1,54 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The differences between a run and its declaration.
+
+The rules are in ``msg_graph.drift``.  Their input comes from the executor's counts, and the
+releases from ``Watch``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mddag_executor.executor.statistics_types import Statistics
+from msg_graph import TaskSet
+from msg_graph.drift import Drift, drift, Observed, Releases
+
+if TYPE_CHECKING:
+    from mddag_executor.executor.executor import MultiDeadlineExecutor
+
+
+class Watch:
+    """Watches an executor from now on."""
+
+    def __init__(self, executor: MultiDeadlineExecutor, task_set: TaskSet) -> None:
+        self._executor = executor
+        self._task_set = task_set
+        self._now = executor._trace_clock.now
+        self._begin = self._now()
+        self._releases = [Releases() for _ in task_set.dags]
+        executor._engine.verdicts.on_release = self._released
+
+    def _released(self, dag: int, release: int) -> None:
+        if dag < len(self._releases):
+            self._releases[dag].add(release)
+
+    def drift(self, statistics: Statistics) -> list[Drift]:
+        """Return the differences between run and declaration; ``statistics`` are its counts."""
+        return drift(self._task_set, self.observed(statistics))
+
+    def observed(self, statistics: Statistics) -> Observed:
+        """Return the observations; ``statistics`` are the run's counts."""
+        first = min((r.first for r in self._releases if r.count), default=self._begin)
+        counts = statistics['callbacks']
+        sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
+        return Observed(
+            duration_ns=max(0, self._now() - first),
+            releases=dict(zip(sources, self._releases)),
+            got={key: count['ready'] for key, count in counts.items()},
+            ran={key: count['ran'] for key, count in counts.items()},
+            came={**self._executor._registry.came()},
+            publishes={**self._executor._registry.publishes()},
+            nodes={key.rpartition(':')[0] for key in counts},
+            undeclared=self._executor._registry.undeclared())
