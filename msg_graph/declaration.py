@@ -123,11 +123,12 @@ def _callback(entry: Entry, node: str, top: str, entries: dict[str, Entry]) -> C
             kinds[1], f'{listed(kinds)} exclude each other', 'keep one, or make two callbacks')
     kind = kinds[0]
     timer_period = entry.get('timer')
+    topics, driven_by = entry.get('sync')
     callback = Callback(
         node=node, name=name, key=key,
         kind=kind,  # type: ignore[arg-type]
         timer_period_ns=timer_period,
-        topics=(entry.get(kind),) if kind == 'subscription' else entry.get('sync'),
+        topics=(entry.get(kind),) if kind == 'subscription' else topics, driven_by=driven_by,
         service=entry.get('service'),
         period_ns=_period(entry, timer_period),
         deadline_ns=None if entry.get('deadline') == NO_DEADLINE else entry.get('deadline'),

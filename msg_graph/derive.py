@@ -13,15 +13,18 @@ Rules 1, 2, 3 and 6 concern callbacks (``_Links``), the others make vertices.
 1. *Trigger edges* come from topics: from each callback that publishes a topic to each subscription
    or sync callback that the topic starts. *Queue edges* (``reads``) start no callback; they only
    serve end-to-end analysis.
-2. A *source* is a timer, or a subscription or service with a ``period:``, whose messages come from
-   outside of the graph. A topic that starts any other callback must be published in the graph.
-   Only a source declares a period, a DAG's name and other properties of a whole DAG.
+2. A *source* is a timer, or a subscription, service or sync with ``driven_by`` with a ``period:``,
+   whose messages come from outside of the graph. A topic that starts any other callback must be
+   published in the graph. Only a source declares a period, a DAG's name and other properties of a
+   whole DAG.
 3. Callbacks and topics must form no cycle. All rules below follow one topological order of both
    together. So a topic with many publishers and many subscribers costs their sum, not their
    product.
 4. *OR*: a subscription callback runs once for each message. So it, and each callback after it, has
    one vertex for each vertex of each publisher of its topic. *AND*: a sync callback is one vertex,
-   after all vertices of all publishers of all its topics.
+   after all vertices of all publishers of all its topics. A sync with ``driven_by`` is like a
+   subscription of that topic; its other topics are queue edges, and may come from outside of the
+   graph.
 5. Hence a vertex that is not a sync has one predecessor and lies in the same DAG. A sync joins
    only vertices of one DAG: two sources joined by a sync are an error. So every vertex leads back
    to exactly one source, and each weakly connected component is the vertices of one source.
@@ -139,15 +142,16 @@ def _derived(
     found = Collector()
     found(for_each, declared.callbacks, links.check_start)
     queue_edges = found(
-        for_each, [(each, read) for each in declared.callbacks for read in each.reads],
-        links.queue_edge)
+        for_each, [(each, read) for each in declared.callbacks
+                   for read in (*each.reads, *each.other_topics)], links.queue_edge)
     found.check()
     order = found(links.order)
     found(for_each, declared.callbacks, lambda each: links.check_end(each, without_deadline))
     found(for_each, declared.paths, links.check_path)
     found.check()
     return replace(
-        declared, queue_edges=tuple(queue_edges), dags=_dags(links, _vertices(links, order)))
+        declared, queue_edges=tuple(edge for edge in queue_edges if edge.writers),
+        dags=_dags(links, _vertices(links, order)))
 
 
 class _Links:
@@ -162,7 +166,7 @@ class _Links:
         for place, callback in enumerate(self.callbacks):
             for topic in callback.publishes:
                 self.publishers.setdefault(topic, []).append(place)
-            for topic in callback.topics:
+            for topic in callback.triggers:
                 self._started.setdefault(topic, []).append(place)
 
     def check_start(self, callback: Callback) -> None:
@@ -186,13 +190,14 @@ class _Links:
             key = 'tolerate' if callback.tolerate else 'importance'
             raise error(key, 'it has no deadline that could be missed',
                         f"remove '{key}:', or give it a deadline")
-        if callback.kind == 'sync' and is_source:
+        if callback.kind == 'sync' and is_source and callback.driven_by is None:
             raise error('period', 'a sync callback joins topics, so it cannot be a source',
-                        "remove 'period:' and declare the publishers of its topics")
+                        "remove 'period:' and declare the publishers of its topics, or say which "
+                        "topic drives it: 'sync: {topics: [...], driven_by: ...}'")
         if not is_source:
             self._check_keys(callback, ('sink',), 'a topic of this graph starts this one',
                              'move it to the source callback')
-        for topic in callback.topics:
+        for topic in callback.triggers:
             publishers = self.publishers.get(topic)
             if is_source and publishers:
                 raise error('period', 'only a source has a period, but '
@@ -201,7 +206,7 @@ class _Links:
                             "'publishes:'")
             if not is_source and not publishers:
                 remedy = "add it to a 'publishes:'"
-                if callback.kind == 'subscription':
+                if callback.kind == 'subscription' or callback.driven_by:
                     remedy += ", or add 'period:' if it comes from outside of the graph"
                 raise error(callback.kind, f'no callback publishes {shown(topic)}',
                             did_you_mean(topic, self.publishers, remedy), item=topic)
@@ -240,7 +245,7 @@ class _Links:
         error = self.entries[callback.key].error
         if read.startswith('/'):
             writers = tuple(self.callbacks[place].key for place in self.publishers.get(read, ()))
-            if not writers:
+            if not writers and read in callback.reads:
                 raise error('reads', f'it reads {shown(read)}, which no callback publishes',
                             did_you_mean(read, self.publishers, "add it to a 'publishes:'"),
                             item=read)
@@ -274,7 +279,7 @@ class _Links:
     def order(self) -> list[int]:
         """Return the callbacks in a topological order; a cycle is an error (rule 3)."""
         before: dict[Any, Iterable[Any]] = dict(self.publishers)
-        before.update((place, () if _is_source(callback) else callback.topics)
+        before.update((place, () if _is_source(callback) else callback.triggers)
                       for place, callback in enumerate(self.callbacks))
         try:
             return [each for each in TopologicalSorter(before).static_order()
@@ -318,9 +323,10 @@ def _vertices(links: _Links, order: list[int]) -> list[list[_Vertex]]:
     for place in order:
         callback = links.callbacks[place]
         publishers = set() if _is_source(callback) else {
-            publisher for topic in callback.topics for publisher in links.publishers[topic]}
+            publisher for topic in callback.triggers for publisher in links.publishers[topic]}
         count = sum(len(vertices[publisher]) for publisher in publishers)
-        size += count + (count if callback.kind == 'subscription' and publishers else 1)
+        is_sync = callback.kind == 'sync' and callback.driven_by is None
+        size += count + (count if publishers and not is_sync else 1)
         if size > MAX_SIZE:
             raise links.entries[callback.key].error(
                 None, f'with it the DAGs have more than {MAX_SIZE} vertices and edges',
@@ -329,7 +335,7 @@ def _vertices(links: _Links, order: list[int]) -> list[list[_Vertex]]:
         before = [vertex for publisher in sorted(publishers) for vertex in vertices[publisher]]
         if not before:
             vertices[place] = [_Vertex(place, place, [])]
-        elif callback.kind == 'sync':
+        elif is_sync:
             _check_one_source(links, callback, before)
             vertices[place] = [_Vertex(place, before[0].source, before)]
         else:
@@ -346,8 +352,8 @@ def _check_one_source(links: _Links, callback: Callback, before: list[_Vertex]) 
     first, second = (shown(links.callbacks[v.source].key) for v in (before[0], other))
     raise links.entries[callback.key].error(
         'sync', f'it joins two sources, {first} and {second}, but a DAG has one',
-        f"read {shown(topic)} by a queue edge: take it out of 'sync:' and list it under "
-        "'reads:'", item=topic)
+        f"say which topic drives it: 'sync: {{topics: [{', '.join(callback.topics)}], driven_by: "
+        f"{callback.topics[0]}}}'; the others become queue edges", item=topic)
 
 
 def _dags(links: _Links, vertices: list[list[_Vertex]]) -> tuple[Dag, ...]:
@@ -406,7 +412,7 @@ def _dag(
             vertex_name += f'#{seen[vertex.callback]}'
         topics = {topic: place for place, topic in enumerate(callback.publishes)}
         after = sorted(vertex.after, key=lambda v: min(
-            topics[topic] for topic in callbacks[v.callback].topics if topic in topics))
+            topics[topic] for topic in callbacks[v.callback].triggers if topic in topics))
         vertices.append(Vertex(
             name=vertex_name, callback=callback, dag=index, index=vertex.index,
             predecessors=tuple(sorted(v.index for v in vertex.before)),

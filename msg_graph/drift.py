@@ -206,6 +206,8 @@ def _due_by_runs(callback: Callback, dags: list[Dag], observed: Observed) -> int
               for i in vertex.predecessors}
     if not before or not before.keys() <= observed.ran.keys():
         return None
+    if any(vertex.callback.driven_by is not None for vertex, _ in before.values()):
+        return None     # not each of its executions publishes
     # a sync runs once for each leg, and publishes once
     return sum(observed.ran[key] // max(1, len(legs_of(*each))) for key, each in before.items())
 

@@ -37,6 +37,10 @@ Schema = dict[str, Any]
 ARGUMENT_USE = r'\$\([A-Za-z_][A-Za-z0-9_]*\)'
 """An argument of the file in a value; the JSON Schema allows it in all values."""
 
+_DRIVEN = "write it inside of the sync, as 'sync: {topics: [/a, /b], driven_by: /a}'"
+ELSEWHERE = {'driven_by': _DRIVEN, 'topics': _DRIVEN}
+"""Keys that are often written in the wrong place, and where they belong."""
+
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _OF = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
@@ -167,8 +171,8 @@ class Entry:
         self._tree = tree
         for key in tree.entries:
             if key not in keys:
-                raise self.error(key, f'unknown key {shown(key)}',
-                                 did_you_mean(key, keys, f'use {", ".join(keys)}'))
+                remedy = ELSEWHERE.get(key) or did_you_mean(key, keys, f'use {", ".join(keys)}')
+                raise self.error(key, f'unknown key {shown(key)}', remedy)
 
     def __contains__(self, key: str) -> bool:
         return key in self._tree.entries
@@ -406,6 +410,20 @@ def _read_execution_time(value: Tree, where: str) -> ExecutionTime:
     return ExecutionTime(tuple(round(us * 1000) for us in quantiles_us), percent)
 
 
+# --- syncs ---------------------------------------------------------------------------------------
+
+def _read_sync(value: Tree, where: str) -> tuple[tuple[str, ...], str | None]:
+    """Return the topics of a sync, the one that drives it first, and that one, if any does."""
+    if not isinstance(value, Mapping):
+        return _SYNCED.read(value, where), None
+    entry = Entry(value, where, SYNC_KEYS)
+    topics, driven_by = entry.get('topics'), entry.get('driven_by')
+    if driven_by not in topics:
+        raise entry.error('driven_by', f'{shown(driven_by)} is none of its topics',
+                          did_you_mean(driven_by, topics, "add it to 'topics:'"))
+    return (driven_by, *(topic for topic in topics if topic != driven_by)), driven_by
+
+
 # --- the keys ------------------------------------------------------------------------------------
 
 def _entries(what: str) -> Kind:
@@ -435,6 +453,15 @@ QUANTILES = {
                    'The shares that they belong to, rising.'),
 }
 _EXECUTION_TIME = Kind(_read_execution_time, {'oneOf': [time().schema, _mapping(QUANTILES)]})
+
+_SYNCED = many(name(TOPIC), 2, different=True,
+               too_few="give at least 2, or write 'subscription:' for one topic")
+SYNC_KEYS = {
+    'topics': Key(_SYNCED, 'The topics.', needed=True),
+    'driven_by': Key(name(TOPIC), 'The one each message of which has a result. The others are '
+                     'queue edges.', needed=True),
+}
+_SYNC = Kind(_read_sync, {'oneOf': [_SYNCED.schema, _mapping(SYNC_KEYS)]}, ((), None))
 
 FILE = {
     'mddag': Key(scalar(_format, {'enum': [int(FORMAT), FORMAT]}),
@@ -466,9 +493,8 @@ NODE_KEYS = {
 TRIGGERS = {
     'timer': Key(time(), 'A timer of this period starts it.'),
     'subscription': Key(name(TOPIC), 'A message on this topic starts it.'),
-    'sync': Key(many(name(TOPIC), 2, different=True,
-                     too_few="give at least 2, or write 'subscription:' for one topic"),
-                'Messages on all of these topics together start it.'),
+    'sync': Key(_SYNC, 'Messages on all of these topics together start it; of topics with '
+                'different rates, one drives it.'),
     'service': Key(name(SERVICE), 'A request of this service starts it.'),
 }
 CALLBACK_KEYS = {

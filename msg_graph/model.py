@@ -93,7 +93,8 @@ class Callback:
     :ivar key: ``node:name``, unique in the declaration.
     :ivar kind: timer, subscription, sync or service.
     :ivar timer_period_ns: period of its timer; None for other kinds.
-    :ivar topics: the topics that start it: one for a subscription, two or more for a sync.
+    :ivar topics: the topics that start it: one for a subscription, two or more for a sync, that
+        of ``driven_by`` first.
     :ivar service: the service that it serves, or None.
     :ivar period_ns: of a source, the period of its DAG, declared or its timer's; else None.
     :ivar publishes: topics that it publishes, including those of ``may_publish``, which come last.
@@ -117,6 +118,8 @@ class Callback:
     :ivar once: of a timer: whether it fires only once.
     :ivar sporadic: of a source that is no timer: whether ``period_ns`` is only the least time
         between two releases.
+    :ivar driven_by: of a sync of different rates: the topic each message of which has a result;
+        the others are queue edges.  None for other syncs.
     :ivar file: name of the file that declares it; None: that of the task set.
     """
 
@@ -146,7 +149,18 @@ class Callback:
     judged: bool = True
     once: bool = False
     sporadic: bool = False
+    driven_by: str | None = None
     file: str | None = None
+
+    @property
+    def triggers(self) -> tuple[str, ...]:
+        """Return the topics that are trigger edges: all, or only that of ``driven_by``."""
+        return self.topics if self.driven_by is None else (self.driven_by,)
+
+    @property
+    def other_topics(self) -> tuple[str, ...]:
+        """Return the topics of a sync that are queue edges, as another one drives it."""
+        return () if self.driven_by is None else self.topics[1:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +372,7 @@ def topological_order(dag: Dag) -> list[int]:
 
 def legs_of(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int, int]]:
     """Return the messages that start a vertex, its legs: topic index and publishing vertex."""
-    topics = vertex.callback.topics
+    topics = vertex.callback.triggers
     if len(topics) <= 1:
         return [(0, before) for before in vertex.predecessors]
     return [
@@ -374,7 +388,7 @@ def optional_edges(vertex: Vertex, vertices: Sequence[Vertex]) -> list[tuple[int
         this vertex completes without publishing the topic.
     """
     return [(after, topic) for after in vertex.successors
-            for topic in vertices[after].callback.topics
+            for topic in vertices[after].callback.triggers
             if topic in vertex.callback.may_publish]
 
 

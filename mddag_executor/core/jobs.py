@@ -36,7 +36,7 @@ from mddag_executor.core.state import (
     State,
     URGENCY,
 )
-from mddag_executor.core.tables import DEMOTE, KEEP_NEWEST, NEVER, Tables
+from mddag_executor.core.tables import AFTER_DRIVEN, DEMOTE, KEEP_NEWEST, NEVER, Tables
 
 
 def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int) -> int:
@@ -68,6 +68,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
         s.x_state[x] = IDLE
         s.x_pending[x] = t.n_predecessors[s.x_vertex[x]]
         s.x_worker[x] = -1
+        s.x_follows[x] = 0
     if s.partial[dag] != 0:
         _leave_out(t, s, slot)
     return slot
@@ -257,12 +258,28 @@ def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
         close_job(s, slot, OUTDATED, now)
 
 
+def withhold_from(t: Tables, s: State, slot: int, by: int, vertex: int, now: int) -> None:
+    """
+    Note that an execution which is about to end has not published what starts a vertex (rule 15).
+
+    The vertex is not due in the job, nor in those in which the publishing vertex completes with
+    this job's (rule 16).  A driver calls this before it reports the end of the execution.
+    """
+    older = s.job_previous[slot]
+    withhold(t, s, slot, vertex, now)
+    while older >= 0 and t.driven[by] >= AFTER_DRIVEN:
+        before = s.job_previous[older]
+        x = s.job_base[older] + t.region_offset[by]
+        if s.x_follows[x] != 0 and s.x_pending[x] >= 0:
+            withhold(t, s, older, vertex, now)
+        older = before
+
+
 def withhold(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
     """
     Note that no message starts a vertex of an open job (rule 15).
 
     The vertex and all after it are not due in this job: a sync among them lacks a leg for good.
-    A driver calls this before it reports the end of the execution that has not published.
     """
     base = s.job_base[slot]
     after = [vertex]
@@ -283,6 +300,26 @@ def withhold(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
             s.job_sinks_left[slot] -= 1
     if s.job_sinks_left[slot] == 0:
         close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
+
+
+def due_of_answer(t: Tables, s: State, vertex: int, now: int) -> int:
+    """
+    Return the reference absolute deadline of an execution that may complete a driven sync.
+
+    It is that of the earliest job whose vertex it may complete in time, or else of the next job
+    (rule 16).
+    """
+    dag = t.dag_of[vertex]
+    slot = s.oldest[dag]
+    while slot >= 0:
+        due = s.job_release[slot] + t.rad_offset[vertex]
+        if due >= now and s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0:
+            return due
+        slot = s.job_next[slot]
+    release = now
+    if s.newest[dag] >= 0 and t.period[dag] < NEVER:
+        release = max(now, s.job_release[s.newest[dag]] + t.period[dag])
+    return release + t.rad_offset[vertex]
 
 
 def next_deadline(t: Tables, s: State, slot: int, after: int) -> int:

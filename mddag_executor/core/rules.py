@@ -99,16 +99,30 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     demoted, as many levels as necessary, but never the highest.
 15. **Not due.**  A vertex may publish some of its topics only sometimes.  If it completes without
     one of them, the vertices that the topic leads to, and all after these, are not due in the job
-    (``withhold``): a sync needs all of its legs.  They get no verdict, and the job does not wait
-    for them.  Until it is known that a sink is due it is not overdue (``is_due``); if its job
+    (``withhold_from``): a sync needs all of its legs.  They get no verdict, and the job does not
+    wait for them.  Until it is known that a sink is due it is not overdue (``is_due``); if its job
     expires or fails before, it is missed.  Sinks without a deadline are never judged.
+16. **Driven syncs.**  Of a sync with ``driven_by`` the message of one topic belongs to a job and
+    starts its vertex; those of the other topics start executions without a job.  Live, the vertex
+    completes with the first execution that *answers* the job: see ``driven``.  In virtual time it
+    completes with its execution, as any other.  An answer also completes the vertex in the older
+    jobs that still await one.  After it these *follow* the answered job: a vertex completes in
+    them when it completes in a later job.  Executions without a job are ordered as if they
+    belonged to the earliest job that they may complete in time (``due_of_answer``).
 """
 
 from __future__ import annotations
 
 from heapq import heappop, heappush
 
-from mddag_executor.core.jobs import close_job, deactivate, give_up, judge, outdate_sink
+from mddag_executor.core.jobs import (
+    close_job,
+    deactivate,
+    give_up,
+    judge,
+    outdate_sink,
+    withhold,
+)
 from mddag_executor.core.overload import (
     announce_late,
     demote,
@@ -140,6 +154,7 @@ from mddag_executor.core.state import (
     DROPPED,
     FAILED,
     HELD_BACK,
+    IDLE,
     LATE,
     LEADS_OUT,
     N_HOLDING,
@@ -160,7 +175,7 @@ from mddag_executor.core.state import (
     SWITCH_OVERHEAD,
     WAITING,
 )
-from mddag_executor.core.tables import KEEP_ALL, KEEP_NEWEST, Tables
+from mddag_executor.core.tables import AFTER_DRIVEN, DRIVEN, KEEP_ALL, KEEP_NEWEST, Tables
 
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
@@ -507,15 +522,58 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     slot = s.x_slot[x]
     head = s.job_base[slot] + t.region_offset[vertex]
     whole = True
-    if s.scalars[PROPAGATE] == 0 and t.n_predecessors[vertex] > 0:
-        s.x_pending[head] -= 1
-        whole = s.x_pending[head] == 0
+    if s.scalars[PROPAGATE] == 0:
+        if t.driven[vertex] & DRIVEN != 0:
+            whole = False  # the driver says which execution answers
+        elif t.n_predecessors[vertex] > 0:
+            s.x_pending[head] -= 1
+            whole = s.x_pending[head] == 0
     if whole:
         s.x_pending[head] = -1
         if s.job_state[slot] == OPEN:
             _complete_vertex(t, s, key, slot, vertex, now)
     deactivate(s, slot)
     return whole
+
+
+def answer(
+    t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, answered: int, now: int
+) -> None:
+    """
+    Complete a driven sync in an open job, live (rule 16).
+
+    :param answered: the slot of the job that an execution answers: this one, or a later one, which
+        this one follows from now on.
+    """
+    head = s.job_base[slot] + t.region_offset[vertex]
+    if s.job_state[slot] != OPEN or s.x_pending[head] < 0:
+        return
+    s.x_pending[head] = -1
+    _complete_vertex(t, s, key, slot, vertex, now)
+    if slot != answered:
+        follow(t, s, key, slot, vertex, answered, now)
+
+
+def follow(
+    t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, answered: int, now: int
+) -> None:
+    """Let the vertices after a driven sync complete when they do in a later job (rule 16)."""
+    base, other = s.job_base[slot], s.job_base[answered]
+    after = [vertex]
+    while len(after) > 0:
+        v = after.pop()
+        for i in range(t.first_successor[v], t.first_successor[v + 1]):
+            successor = t.successors[i]
+            x, there = base + t.region_offset[successor], other + t.region_offset[successor]
+            if s.x_follows[x] != 0 or s.x_pending[x] < 0 or s.job_state[slot] != OPEN:
+                continue
+            s.x_follows[x] = 1
+            after.append(successor)
+            if s.x_pending[there] < 0 and s.x_state[there] == IDLE:
+                withhold(t, s, slot, successor, now)
+            elif s.x_pending[there] < 0:
+                s.x_pending[x] = -1  # the message was published before the execution ended
+                _complete_vertex(t, s, key, slot, successor, now)
 
 
 def fail(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
@@ -536,6 +594,25 @@ def _release_group(s: State, group: int) -> None:
 def _complete_vertex(
     t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
 ) -> None:
+    """Complete a vertex in an open job, and in those that follow it there (rule 16)."""
+    before = s.job_previous[slot]
+    _complete_in(t, s, slot, vertex, now)
+    if t.driven[vertex] >= AFTER_DRIVEN and s.scalars[PROPAGATE] == 0:
+        older = before
+        while older >= 0:
+            before = s.job_previous[older]
+            x = s.job_base[older] + t.region_offset[vertex]
+            if s.x_follows[x] != 0 and s.x_pending[x] >= 0:
+                s.x_pending[x] = -1
+                _complete_in(t, s, older, vertex, now)
+            older = before
+    if s.scalars[PROPAGATE] == 1:  # a sink, which may have ended the job, has no successors
+        for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
+            edge(t, s, key, slot, t.successors[i], now)
+
+
+def _complete_in(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
+    """Complete a vertex in one job: judge it if it is a sink, and end the job after its last."""
     is_sink = t.sink_deadline[vertex] >= 0
     late = False
     if is_sink:
@@ -549,6 +626,3 @@ def _complete_vertex(
         s.job_sinks_left[slot] -= 1
         if s.job_sinks_left[slot] == 0:
             close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
-    if s.scalars[PROPAGATE] == 1:  # a sink, which may have ended the job, has no successors
-        for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
-            edge(t, s, key, slot, t.successors[i], now)

@@ -44,6 +44,7 @@ class Scheduler:
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
         did not complete its vertex.
     :ivar fail: ``fail(x, now)`` ends a failed execution; see ``complete``.
+    :ivar answer: ``answer(slot, vertex, answered, now)`` completes a driven sync (rule 16).
     :ivar resume: ``resume(x, job, holds, now)`` makes a suspended execution, or one that has lent
         its worker, ready to go on.
 
@@ -79,6 +80,8 @@ class Scheduler:
         self.go_on_without: Callable[[int], None] = partial(rules.go_on_without, self.state)
         self.resume: Callable[[int, int, int, int], None] = partial(
             rules.resume, *rule, self.policy.key)
+        self.answer: Callable[[int, int, int, int], None] = partial(
+            rules.answer, *rule, self.policy.key)
         self.finish: Callable[[int], None] = partial(jobs.finish, *rule)
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
@@ -106,10 +109,10 @@ class Scheduler:
         if self.state.job_state[slot] == OPEN:
             jobs.give_up(self.tables, self.state, slot, end, now)
 
-    def withhold(self, slot: int, vertex: int, now: int) -> None:
+    def withhold(self, slot: int, by: int, vertex: int, now: int) -> None:
         """Note that no message starts a vertex of the job in a slot (``core.jobs.withhold``)."""
         if self.state.job_state[slot] == OPEN:
-            jobs.withhold(self.tables, self.state, slot, vertex, now)
+            jobs.withhold_from(self.tables, self.state, slot, by, vertex, now)
 
     def expire_idle(self, now: int) -> None:
         """Expire every job that can no longer complete."""

@@ -141,6 +141,8 @@ class State(NamedTuple):
     x_cost: list[int]
     # of a sink: the last demoted job
     x_demoted: list[int]
+    # 1: it completes when it does in a later job (rule 16)
+    x_follows: list[int]
     # decisions that the driver has not fetched yet
     decisions: list[Decision]
 
@@ -261,6 +263,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_left.append(0)
             s.x_cost.append(0)
             s.x_demoted.append(-1)
+            s.x_follows.append(0)
 
 
 def divide(s: State, workers: list[int]) -> None:

@@ -36,6 +36,9 @@ topic is one that the vertex may publish.  ``gates``, from ``first_gate`` of a s
 executions, as offsets in the region of a job, that such edges on its paths start; the sink is due
 when all of them are known to start.
 
+``driven``: DRIVEN for a sync with ``driven_by`` (rule 16), AFTER_DRIVEN for all vertices after
+one, their sum for both.
+
 ``judged``: 0 for a sink without a deadline (``deadline: none``).  It is ordered as if it had one
 of ``UNJUDGED_PERIODS`` periods: behind nearly everything that has a deadline, and it never
 starves.
@@ -80,6 +83,8 @@ UNJUDGED_NS = 1_000_000_000
 CONTINUE, DEMOTE = range(2)
 KEEP_ALL, KEEP_TIMELY, KEEP_NEWEST = range(3)
 """Which waiting executions remain when the next one is ready (rule 13)."""
+DRIVEN, AFTER_DRIVEN = 1, 2
+"""Bits of ``Tables.driven``."""
 IMPORTANCE = {'low': 0, 'normal': 1, 'high': 2}
 IMPORTANT = 2
 """The highest importance."""
@@ -137,6 +142,7 @@ class Tables(NamedTuple):
     first_successor: list[int]
     successors: list[int]
     is_optional: list[int]
+    driven: list[int]
     first_gate: list[int]
     gates: list[int]
     group: list[int]
@@ -254,6 +260,12 @@ class _Columns:
             lists['group'].append(self._group(vertex.callback.node, vertex.callback.group))
             region += len(topics)
         self._add_gates(dag, first, maybe)
+        lists['driven'].extend([0] * len(dag.vertices))
+        for index in topological_order(dag):
+            vertex, at = dag.vertices[index], first + index
+            lists['driven'][at] |= int(vertex.callback.driven_by is not None) * DRIVEN
+            for after in vertex.successors if lists['driven'][at] else ():
+                lists['driven'][first + after] |= AFTER_DRIVEN
         lists['period'].append(NEVER if dag.once else dag.period_ns)
         leaves = [vertex for vertex in dag.vertices if not vertex.successors]
         judged = [dag.vertices[sink] for sink in dag.sinks]
@@ -301,7 +313,7 @@ class _Columns:
             'entity': self._n_entities, 'region_offset': 0,
             'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
-            'first_gate': len(lists['gates']), 'group': -1, 'process': 1,
+            'driven': 0, 'first_gate': len(lists['gates']), 'group': -1, 'process': 1,
             'period': default_deadline, 'dag_deadline': default_deadline, 'on_late': self._on_late,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
             'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),

@@ -17,6 +17,8 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     dropped and counted, and with ``DEMOTE`` late ones of jobs after it: a queue that stays full
     would make every message wait for as many periods.  The place of a dropped message is its
     queue's (``core.queues``), so a queue that overflows permanently gets its turn.
+    Messages of the other topics of a driven sync belong to no job.  The execution that they start
+    may complete the vertex of one (``core.driven``): ``Work.answers``.
 3.  *The core decides* what to run (``dispatch``), and handles the ends of executions
     (``finished``, ``suspended``, ``refused``, …): see ``core.rules``.
 4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
@@ -37,9 +39,10 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
+from mddag_executor.core.driven import Awaiting
 from mddag_executor.core.estimates import note_time
 from mddag_executor.core.invariants import broken_invariants
-from mddag_executor.core.jobs import is_judged, judge_from
+from mddag_executor.core.jobs import due_of_answer, is_judged, judge_from
 from mddag_executor.core.overload import admit, is_late
 from mddag_executor.core.queues import first_of, overtaking_pays, overtaking_pays_from
 from mddag_executor.core.state import (
@@ -104,6 +107,13 @@ class Engine:
                 if several := optional_edges(vertex, dag.vertices):
                     self._optional_edges[first + vertex.index] = [
                         (first + after, topic) for after, topic in several]
+        #: By the key of a callback that is a driven sync.
+        self.awaiting: dict[str, Awaiting[Origin]] = {}
+        self._driven: dict[str, list[int]] = {}     # its vertices
+        for number, each in enumerate(task_set.vertices if task_set else ()):
+            if each.callback.driven_by is not None:
+                self._driven.setdefault(each.callback.key, []).append(number)
+                self.awaiting.setdefault(each.callback.key, Awaiting(each.callback))
         admit(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.jobs, process)
@@ -161,10 +171,14 @@ class Engine:
             entity.skipped += 1
             if entity.source >= 0:
                 self._skip_job(entity, max(entity.since, min(due, now)), now)
-        elif entity.source >= 0:
+        elif entity.source >= 0 and not self._is_over(self.tables.dag_of[entity.source]):
             self._start_job(work, max(entity.since, min(due, now)), now)
         else:
             self.ready(work, now)
+
+    def _is_over(self, dag: int) -> bool:
+        """Return whether a timer that fires once has: its callback, which cancels it, is late."""
+        return self.tables.period[dag] == NEVER and self._next_job[dag] > 0
 
     def timer_missed(self, entity: Entity, due: int, period: int, count: int, now: int) -> None:
         """
@@ -192,6 +206,9 @@ class Engine:
         :param stamp: of its header if that identifies the job, else -1.
         """
         entity = work.entity
+        if entity.may_answer:
+            self.ready(work, now)
+            return
         if entity.removed or self._finished:
             return
         if entity.source >= 0:
@@ -218,10 +235,10 @@ class Engine:
         entity = work.entity
         if entity.removed or self._finished:
             return
-        self.undeclared += 1
+        self.undeclared += not entity.may_answer
         work.ready_ns = now
         waiting = entity.waiting
-        if 0 < entity.depth <= len(waiting):
+        if entity.may_answer or 0 < entity.depth <= len(waiting):
             self._core()
         elif not self._is_bypassed:
             self._is_bypassed = self._may_bypass and self._is_core_empty()
@@ -240,6 +257,8 @@ class Engine:
         entity, since = work.entity, work.ready_ns
         if entity.queue < 0:
             entity.queue = self.scheduler.new_queue()
+        if entity.may_answer and self._keys_are_times:
+            since = self._since_of_answer(entity, since)
         if entity.callback is not None and entity.waiting and self._keys_are_times:
             # It belongs to no job, but comes after the messages that wait already.  Only the last
             # one, and the last one without a job, are compared: there may be many.
@@ -255,6 +274,12 @@ class Engine:
             entity.ready, entity.group, entity.habit.holds, entity.queue, since)
         entity.waiting[x] = None
         self._work[x] = work
+
+    def _since_of_answer(self, entity: Entity, now: int) -> int:
+        """Return since when an execution counts as ready to be ordered by the job it answers."""
+        assert entity.callback is not None
+        return min(due_of_answer(self.tables, self._state, vertex, now)
+                   for vertex in self._driven[entity.callback.key]) - self._default_deadline
 
     def allow_bypass(self) -> None:
         """Let undeclared executions bypass the core, if the policy runs them as they come."""
@@ -327,7 +352,10 @@ class Engine:
 
     def _skip_job(self, entity: Entity, release: int, now: int) -> None:
         """Account for a release whose source does not run: the job expires at once."""
-        slot = self._release(self.tables.dag_of[entity.source], release, now)
+        dag = self.tables.dag_of[entity.source]
+        if self._is_over(dag):
+            return
+        slot = self._release(dag, release, now)
         self.scheduler.give_up(slot, EXPIRED, now)
         self._decided(now)
 
@@ -484,9 +512,31 @@ class Engine:
         work = self._work.pop(x)
         work.entity.waiting.pop(x, None)  # one that goes on was removed before
         work.worker = worker
+        if work.entity.awaiting is not None and work.answers is None:
+            self._begin_driven(work, work.entity.awaiting)
         if state.x_holds[x]:
             self.holders.append(work)
         return work
+
+    def _begin_driven(self, work: Work, awaiting: Awaiting[Origin]) -> None:
+        """Note the start of an execution of a driven sync: which job it may answer."""
+        awaiting.hear(work.entity.topic)
+        if work.origin is not None:
+            awaiting.receive(work.origin)
+            work.answers = work.origin
+        else:
+            work.answers = awaiting.newest(self._is_open) or NO_ORIGIN
+
+    def _is_open(self, origin: Origin) -> bool:
+        return self.open_release(origin) is not None
+
+    def _answered(self, work: Work) -> list[Origin]:
+        """Return the jobs whose driven sync an execution completes, the one it answers first."""
+        awaiting, job = work.entity.awaiting, work.answers
+        if awaiting is None or job is None or job is NO_ORIGIN or not (
+                self._is_open(job) and awaiting.is_answer(work.published)):
+            return []
+        return [each for each in awaiting.answer(job) if self._is_open(each)]
 
     def relative_deadline(self, entity: Entity) -> int:
         """Return the least time (ns) from an arrival at an entity to its deadline, or a guess."""
@@ -625,25 +675,36 @@ class Engine:
         self._let_go(work)
         origin, record = work.origin, self.record
         entity.failed += failed
-        if origin is not None and origin.vertex in self._optional_edges:
-            self._withhold(origin, failed, end)
-        if self.verdicts.tally.overdue and origin is not None:
-            deadline = self.verdicts.tally.overdue.get((origin.vertex, origin.job), -1)
-            if end <= deadline:  # it was reported overdue before this was known
-                entity.busy_ns += deadline + 1 - end
-                end = deadline + 1
+        completes = [] if origin is None else [origin]
+        if entity.awaiting is not None:
+            completes = [] if failed else self._answered(work)
+            origin = completes[0] if completes else origin
+        for each in completes:
+            if each.vertex in self._optional_edges:
+                self._withhold(work, each, failed, end)
+        if self.verdicts.tally.overdue:
+            for each in completes:
+                deadline = self.verdicts.tally.overdue.get((each.vertex, each.job), -1)
+                if end <= deadline:  # it was reported overdue before this was known
+                    entity.busy_ns += deadline + 1 - end
+                    end = deadline + 1
         whole = (self.scheduler.fail if failed else self._complete)(x, end)
+        if entity.awaiting is not None:
+            whole = bool(completes)
+            for each in completes:
+                self.scheduler.answer(each.slot, each.vertex, completes[0].slot, end)
         if origin is not None:
             tables, state = self.tables, self._state
             slot, dag, job, vertex = origin
+            leg = 0 if entity.may_answer else (
+                x - state.job_base[slot] - tables.region_offset[vertex])
             if record is not None:
                 if failed:  # first, or its completion would count
                     record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
                 record(
                     EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex], job,
                     worker, work.ready_ns, state.job_release[slot] + tables.rad_offset[vertex],
-                    end, now, whole, x - state.job_base[slot] - tables.region_offset[vertex],
-                    work.cpu_ns, state.x_holds[x])
+                    end, now, whole, leg, work.cpu_ns, state.x_holds[x])
             if whole:  # other messages of a sync take less
                 note_time(tables, state, vertex, entity.habit.needs_ns, entity.habit.holds, now)
         elif record is not None:
@@ -651,17 +712,19 @@ class Engine:
         if self._state.decisions:
             self._decided(now)
 
-    def _withhold(self, origin: Origin, failed: bool, now: int) -> None:
+    def _withhold(self, work: Work, origin: Origin, failed: bool, now: int) -> None:
         """Leave out of a job what an execution that ends might have started, but has not."""
         slot, _, _, vertex = origin
         pending = self._state.x_pending[self.scheduler.execution(slot, vertex)]
         if pending > 1:
             return  # a leg of a sync that was not the last
         published = self.jobs.published(origin)
+        if work.entity.awaiting is not None:
+            published = set(work.published)
         if not failed and pending >= 0:
             for after, topic in self._optional_edges[vertex]:
                 if topic not in published:
-                    self.scheduler.withhold(slot, after, now)
+                    self.scheduler.withhold(slot, vertex, after, now)
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
@@ -682,6 +745,7 @@ class Engine:
             return
         self._let_go(work)
         self.scheduler.refuse(x)
+        work.answers = None
         self._work[x] = work
         entity.waiting = {x: None, **entity.waiting}
         self.to_ask_again.append(entity)

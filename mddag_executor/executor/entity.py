@@ -10,9 +10,10 @@ import functools
 from typing import Any
 
 from mddag_executor.core import legs_of, Tables
+from mddag_executor.core.driven import Awaiting
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.gil import GilHabit
-from mddag_executor.executor.jobs import new_address
+from mddag_executor.executor.jobs import new_address, Origin
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import entity_name
 
@@ -42,7 +43,7 @@ class Entity:
         'skipped', 'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
         'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
         'publishes', 'at_once', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
-        'collect_more', 'counts_as_eager', 'queue', '__weakref__')
+        'collect_more', 'counts_as_eager', 'queue', 'awaiting', 'may_answer', '__weakref__')
 
     def __init__(
         self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
@@ -66,6 +67,9 @@ class Entity:
         self.remote_publishers: list[int] = []
         # whether other processes announce publications for it; whether it receives announcements
         self.awaits = False
+        # of a topic of a driven sync: its jobs; whether another topic drives it
+        self.awaiting: Awaiting[Origin] | None = None
+        self.may_answer = False
         self.is_own = False
         # its waiting executions, the oldest first
         self.waiting: dict[int, None] = {}
@@ -179,6 +183,9 @@ def link(entity: Entity, task_set: TaskSet, tables: Tables, topic: str) -> None:
     callback = entity.callback
     assert callback is not None
     entity.topic = topic
+    if topic in callback.other_topics:
+        entity.may_answer = True
+        return
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
         for vertex in dag.vertices:

@@ -128,9 +128,11 @@ def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Pub
                 return None
             state.is_tracked = True
             work = running.work
-            origin = NO_ORIGIN if work is None or work.origin is None else work.origin
+            origin = None if work is None else work.origin or work.answers
+            if work is not None and work.entity.awaiting is not None:
+                work.published |= {state.topic}
             publication: Publication = running.engine.jobs.publish(
-                original, publisher, msg, state, topic, origin)
+                original, publisher, msg, state, topic, origin or NO_ORIGIN)
             return publication
         except BaseException:
             state.count -= 1  # the middleware has not counted it

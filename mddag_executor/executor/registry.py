@@ -262,6 +262,7 @@ class Registry:
         if callback is not None:
             assert self._task_set is not None
             link(entity, self._task_set, self._tables, topic)
+            entity.awaiting = self._engine.awaiting.get(callback.key)
             entity.publishes = self._published[callback.key]
             if kind == TIMER and entity.source >= 0:
                 scheduler = self._engine.scheduler

@@ -92,6 +92,9 @@ class Work:
     :ivar then: called with its result, or None: sends a service's response.
     :ivar x: the execution in the core; -1 before it is ready and after it has ended.
     :ivar origin: its vertex and job; None if it is undeclared.
+    :ivar answers: of a driven sync, the vertex and job that it completes if it publishes; None
+        before it starts, and for other callbacks.
+    :ivar published: of a driven sync, the topics that it has published.
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: its CPU time.
@@ -101,7 +104,7 @@ class Work:
 
     __slots__ = (
         'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
-        'ready_ns', 'cpu_ns', 'yields')
+        'ready_ns', 'cpu_ns', 'yields', 'answers', 'published')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -113,6 +116,8 @@ class Work:
         self.then = then
         self.coroutine: Any = None
         self.origin: Origin | None = None
+        self.answers: Origin | None = None
+        self.published: frozenset[str] = frozenset()
         self.x = self.worker = -1
         self.ready_ns = self.cpu_ns = self.yields = 0
 

@@ -22,9 +22,12 @@ from dataclasses import replace
 
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import (
+    Mask,
     Recording,
     RowNumbers,
+    VERTEX,
 )
+from msg_graph.model import topological_order
 import numpy as np
 
 
@@ -50,7 +53,7 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
     jobs, job_of = recording.jobs, recording.job_places
     in_range = (released['release'] >= begin) & (released['release'] < end)
     judged = jobs.marked(in_range)
-    own = judged[job_of]
+    own = judged[job_of] | _followed(recording, end)
     ends = recording.job_ends
     until = max(
         min(end, recording.end), *(int(times.max(initial=begin)) for times in (
@@ -89,3 +92,31 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
         demotions=demotions[(demotions['time'] >= begin) & (demotions['time'] < last)],
         misses=recording.misses[judged[jobs.places(recording.misses)]],
         start=begin, end=until, judged_releases=(begin, end), whole=recording.whole or recording)
+
+
+def _followed(recording: Recording, end: int) -> Mask:
+    """
+    Return which executions later jobs may complete those of the range with (``driven_by``).
+
+    Those are the executions of the first jobs after the range in which a driven sync, or a vertex
+    after it, has completed.
+    """
+    table, released = recording.executions, recording.releases
+    found = np.zeros(len(table), dtype=np.bool_)
+    first = 0
+    for dag in recording.task_set.dags:
+        after: set[int] = set()
+        for v in topological_order(dag):
+            vertex = dag.vertices[v]
+            if vertex.callback.driven_by is not None or not after.isdisjoint(vertex.predecessors):
+                after.add(v)
+        later = released[(released['dag'] == dag.index) & (released['release'] >= end)]['job']
+        for v in sorted(after):
+            mine = np.flatnonzero(
+                (table['vertex'] == first + v) & (table['completes'] == VERTEX))
+            numbers = table['job'][mine]
+            numbers = numbers[np.isin(numbers, later)]
+            if len(numbers):
+                found |= (table['dag'] == dag.index) & (table['job'] == numbers.min())
+        first += len(dag.vertices)
+    return found

@@ -19,6 +19,9 @@ first link is the source.  The response time (completion minus release) is the s
 * transport: from the end of an execution until the next vertex was ready;
 * unknown: the time before the first recorded link.
 
+An execution of a driven sync (``driven_by``) may have been ready before the driving message was
+published.  It waits for the job from then on.
+
 A vertex has one execution in a job: the one that completed it, otherwise the last one that started
 before the job ended.  If that one never completed, it is unknown when it ended and which message
 started it; the message of the publisher that ended last is assumed.
@@ -108,6 +111,10 @@ class Chains:
         self._legs = [
             [[before for _, before in legs_of(vertex, dag.vertices)] for vertex in dag.vertices]
             for dag in judged.task_set.dags]
+        #: By DAG and vertex whether it is a driven sync.
+        self._is_driven = [
+            np.array([vertex.callback.driven_by is not None for vertex in dag.vertices])
+            for dag in judged.task_set.dags]
         # the last one is -1, none
         self._started = np.append((executions['vertex'] >= 0) & (executions['start'] >= 0), False)
         self._is_other = self._started.copy()
@@ -178,6 +185,10 @@ class Chains:
                 np.array([start - ready, zero, zero, links['group']]))
             if legs:
                 leg, published = _published([chains[each] for each in legs], leg, ready)
+                if self._is_driven[dag][v]:
+                    ready = np.where(published.known, _answers_from(
+                        ready, start, published.end), ready)
+                    chain.sums[0] = start - ready
                 good, chain = chain.after(published, ready)
                 before[v] = np.where(good, np.array(legs)[leg], -1)
             if v in task.sinks:
@@ -191,8 +202,11 @@ class Chains:
         while len(which):
             links = self._links(dag, vertex, row[vertex, job])
             links['of'] = which
+            driven, vertex = self._is_driven[dag][vertex], before[vertex, job]
+            ended = self._executions['end'][row[vertex, job]]
+            links['ready'] = np.where(driven & (vertex >= 0), _answers_from(
+                links['ready'], links['start'], ended), links['ready'])
             yield links
-            vertex = before[vertex, job]
             more = vertex >= 0
             which, vertex, job = which[more], vertex[more], job[more]
 
@@ -284,6 +298,16 @@ def _published(several: Sequence[_Chain], leg: Ints, ready: Ints) -> tuple[Ints,
         for number, each in enumerate(several):
             found = _Chain(*(np.where(leg == number, new, old) for new, old in zip(each, found)))
     return np.maximum(leg, 0), found
+
+
+def _answers_from(ready: Ints, start: Ints, published: Ints) -> Ints:
+    """
+    Return from when on executions of a driven sync wait to complete a job.
+
+    The message of another topic may have come before the driving message was published.
+    """
+    found: Ints = np.maximum(ready, np.minimum(published, start))
+    return found
 
 
 def _step_result(task_set: TaskSet, link: Any) -> dict[str, Any]:

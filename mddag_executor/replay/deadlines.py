@@ -5,8 +5,8 @@ The verdicts of a recording, computed from its tables.
 
 Theory of operation
 -------------------
-The rules are rules 1, 2, 6, 8 and 10 of the scheduler core (``core.rules``), applied to all jobs
-at once; ``test/replay/test_deadlines.py`` compares both implementations.
+The rules are rules 1, 2, 6, 8, 10, 15 and 16 of the scheduler core (``core.rules``), applied to
+all jobs at once; ``test/replay/test_deadlines.py`` compares both implementations.
 
 1. A vertex completes when the last of its legs completes; in an imported recording, with the
    execution that is marked as the last one of the job (``imported_jobs``).
@@ -17,7 +17,11 @@ at once; ``test/replay/test_deadlines.py`` compares both implementations.
    overdue.  A sink is not due, and gets no verdict, if a vertex before it completed without
    publishing a topic of ``may_publish`` that leads to it.
 4. Jobs released before ``judge_from`` or outside ``judged_releases`` are not judged.
-5. A change of the vertices that a process expects (``hosted``) applies to jobs released after it.
+5. A driven sync (``driven_by``) completes with the execution that answered its job, which is the
+   one that is recorded as completing.  A job whose driving message was received, and that was not
+   answered itself, is completed by the first answer to a job with a later driving message.  Its
+   vertices after the sync complete with those of later jobs.
+6. A change of the vertices that a process expects (``hosted``) applies to jobs released after it.
 
 The executor's recorded misses must equal the computed ones.  If they differ, the recording is
 incomplete or this program is wrong; ``Judged.differences`` reports it.
@@ -51,6 +55,7 @@ from mddag_executor.core.state import (
     SINK_MISSED,
     SINK_NOT_DUE,
 )
+from mddag_executor.core.tables import DRIVEN
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.columns import concatenate, rows, Table
@@ -78,7 +83,7 @@ Columns of the table of verdicts: one row per judged job and sink, in order.
 is the time of completion, or of the end of the job; ``row`` is the job's row in ``Jobs``.
 """
 
-_NO_JOBS: Ints = np.empty(0, dtype=np.int64)
+_NO_ROWS: Ints = np.empty(0, dtype=np.int64)
 _ENDS = {
     recorded.EXPIRED: (EXPIRED, SINK_EXPIRED), recorded.ABORTED: (ABORTED, SINK_ABORTED),
     recorded.FAILED: (FAILED, SINK_FAILED), recorded.OUTDATED: (OUTDATED, SINK_DROPPED)}
@@ -127,8 +132,8 @@ class Judged:
         self.judge_from = _judge_from(recording, skip)
         ends = [recording.job_ends[mine] for mine in rows_by(
             recording.job_ends['dag'], len(task_set.dags))]
-        completions = _completions(
-            recording.executions, len(task_set.dags), recording.links)
+        completions = _completions(recording.executions, len(task_set.dags), np.array([
+            bool(recording.links or driven & DRIVEN) for driven in self.tables.driven]))
         self.jobs: list[JudgedJobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
@@ -165,6 +170,9 @@ class Judged:
         # by job and vertex the position at which it completed
         position = np.full(jobs.done.shape, NEVER)
         duplicates = self._complete(dag, jobs, completions, expected, position)
+        for vertex in self.task_set.dags[dag].vertices:
+            if vertex.callback.driven_by is not None:
+                self._follow(dag, vertex.index, jobs, position)
         sinks = self.tables.sinks[self.tables.first_sink[dag]:self.tables.first_sink[dag + 1]]
         local = np.array(sinks, dtype=np.int64) - first
         here = expected[:, local] == HERE if expected is not None else \
@@ -239,6 +247,41 @@ class Judged:
                 when[row[row >= 0], place] = mine['time'][row >= 0]
         return dropped, when
 
+    def _follow(self, dag: int, sync: int, jobs: JudgedJobs, position: Ints) -> None:
+        """Complete jobs by the answers of a driven sync to later ones (rule 5)."""
+        ran, vertex = self._recording.executions, self.tables.first_vertex[dag] + sync
+        which = np.flatnonzero((ran['vertex'] == vertex) & (ran['start'] >= 0))
+        row = jobs.rows_of(ran['job'][which])
+        received = np.full(len(jobs.number), NEVER)
+        np.minimum.at(received, row[row >= 0], ran['start'][which][row >= 0])
+        answered_at = np.where(received < NEVER, position[:, sync], NEVER)
+        in_order = sort_by(received)
+        first = np.minimum.accumulate(answered_at[in_order][::-1])[::-1]
+        waiting = (first < NEVER) & (answered_at[in_order] >= NEVER) & (
+            received[in_order] < NEVER)
+        answers = dict(zip(answered_at.tolist(), range(len(answered_at))))
+        vertices = self.task_set.dags[dag].vertices
+        after = {sync}
+        for v in topological_order(self.task_set.dags[dag]):
+            if after.isdisjoint(vertices[v].predecessors) and v != sync:
+                continue
+            after.add(v)
+            own = position[:, v].copy()
+            sorted_rows = np.argsort(own, kind='stable')
+            for at, job in zip(first[waiting].tolist(), in_order[waiting].tolist()):
+                answered = answers[at]
+                by, when = answered, max(int(own[answered]), at)
+                place = int(np.searchsorted(own, at, 'right', sorter=sorted_rows))
+                while place < len(own) and sorted_rows[place] <= job:
+                    place += 1
+                if place < len(own) and own[sorted_rows[place]] < when:
+                    by, when = int(sorted_rows[place]), int(own[sorted_rows[place]])
+                if when < min(NEVER, position[job, v]):
+                    position[job, v] = when
+                    # completed there before the answering execution ended: with that
+                    jobs.done[job, v] = jobs.done[answered, sync] if own[by] < when else (
+                        jobs.done[by, v])
+
     def _withheld(self, dag: int, jobs: JudgedJobs, position: Ints) -> Ints:
         """
         Return by job and vertex the position from which on it is known not to be due (NEVER: due).
@@ -255,6 +298,12 @@ class Judged:
             found[position[:, v] < found[:, v], v] = NEVER
             for after, topic in optional_edges(vertex, vertices):
                 silent = self._is_silent(first + v, first + after, topic, jobs)
+                done, driven = jobs.done[:, v], self.tables.driven[first + v]
+                if driven & DRIVEN and self._recording.who.every_publisher:
+                    silent = ~np.isin(done, self._published.get((first + v, topic), _NO_ROWS))
+                elif driven:    # it may have completed with an execution of another job
+                    of = jobs.rows_of(self._recording.executions['job'][done])
+                    silent = np.where((done >= 0) & (of >= 0), silent[of], silent)
                 silent_from = np.where(silent, position[:, v], NEVER)
                 np.minimum(found[:, after], silent_from, out=found[:, after])
             for after in vertex.successors:
@@ -265,18 +314,19 @@ class Judged:
         """Return by job whether a vertex did not publish a topic that starts another vertex."""
         recording = self._recording
         if recording.who.every_publisher:
-            row = jobs.rows_of(self._published.get((vertex, topic), _NO_JOBS))
+            by = self._published.get((vertex, topic), _NO_ROWS)
+            row = jobs.rows_of(recording.executions['job'][by])
             silent = np.ones(len(jobs.number), dtype=np.bool_)
             silent[row[row >= 0]] = False
         else:   # a computed run records no publications, but what was not sent
-            row = jobs.rows_of(recording.unsent.get((vertex, after), _NO_JOBS))
+            row = jobs.rows_of(recording.unsent.get((vertex, after), _NO_ROWS))
             silent = np.zeros(len(jobs.number), dtype=np.bool_)
             silent[row[row >= 0]] = True
         return silent
 
     @cached_property
     def _published(self) -> dict[tuple[int, str], Ints]:
-        """Return by vertex and topic of ``may_publish`` the jobs in which it was published."""
+        """Return by vertex and topic of ``may_publish`` the executions that published it."""
         topics = sorted({t for each in self.task_set.callbacks for t in each.may_publish})
         publishers = self._recording.who.every_publisher
         sent, ran = self._recording.publications, self._recording.executions
@@ -287,7 +337,7 @@ class Judged:
             by = sent['execution'][which]
             vertices, index = different(ran['vertex'][by])
             for vertex, mine in zip(vertices.tolist(), rows_by(index, len(vertices))):
-                found[vertex, topic] = ran['job'][by[mine]]
+                found[vertex, topic] = by[mine]
         return found
 
     def _given_up(self, jobs: JudgedJobs, ends: Table) -> Ints:
@@ -314,7 +364,7 @@ class Judged:
         self.contradictions += len(ends) - int(was_open.sum())
 
     def _expected(self, dag: int, jobs: JudgedJobs) -> Ints | None:
-        """Return by job and vertex whether it is expected; None: all are expected (rule 5)."""
+        """Return by job and vertex whether it is expected; None: all are expected (rule 6)."""
         changes = [(order, vertices) for order, of, vertices in self._recording.hosted
                    if of == dag]
         if not changes:
@@ -472,15 +522,15 @@ def _verdicts(
         row=row, order=order)
 
 
-def _completions(executions: Table, n_dags: int, whole: bool) -> list[Ints]:
+def _completions(executions: Table, n_dags: int, whole: Mask) -> list[Ints]:
     """
     Return by DAG the executions that completed vertices, in the order of their completions.
 
-    :param whole: without those that completed legs.
+    :param whole: by vertex whether only those count that completed it, not those of legs.
     """
-    completes = executions['completes']
-    done = completes == recorded.VERTEX if whole else completes != recorded.NOTHING
-    which = np.flatnonzero(done & (executions['vertex'] >= 0))
+    completes, vertex = executions['completes'], executions['vertex']
+    done = (completes == recorded.VERTEX) | ((completes != recorded.NOTHING) & ~whole[vertex])
+    which = np.flatnonzero(done & (vertex >= 0))
     which = which[sort_by(executions['order'][which])]
     return [which[mine] for mine in rows_by(executions['dag'][which], n_dags)]
 

@@ -122,6 +122,8 @@ def _box(vertex: Vertex, colour: str, ends: Iterable[str]) -> Box:
     lines = [callback.name + several + number]
     if callback.kind == 'timer' and callback.timer_period_ns is not None:
         lines.append(f'timer {format_ns(callback.timer_period_ns)}' + ', once' * callback.once)
+    elif callback.driven_by is not None:
+        lines.append(f'sync by {callback.driven_by}')
     elif callback.kind == 'sync':
         lines.append(f'sync of {len(callback.topics)}')
     elif callback.kind == 'service':

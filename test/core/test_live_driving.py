@@ -214,7 +214,7 @@ class LiveDriver(RuleBasedStateMachine):
         was_open = job is not None and job.end is None
         if silent and not fails and job is not None and self.legs_done[key] == legs:
             for after, _ in self.optional(job.dag, run.vertex):
-                self.scheduler.withhold(job.slot, after, self.now)
+                self.scheduler.withhold(job.slot, run.vertex, after, self.now)
         end = self.scheduler.fail if fails else self.scheduler.complete
         whole = end(run.x, self.now)
         assert whole == (self.legs_done[key] == legs)

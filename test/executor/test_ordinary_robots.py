@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What ordinary robots do: publish sometimes, store values, start once, wait for a button."""
 
+from functools import partial
+from itertools import count
 import time
 
 from mddag_executor.executor import current_job
@@ -10,6 +12,7 @@ from mddag_executor.replay.drafting import System
 from msg_graph import loads
 from msg_graph.draft import declaration_of
 import pytest
+from std_msgs.msg import Header
 
 from .conftest import is_idle, Spinning, wait_for
 from .declared import Declared, graph
@@ -130,3 +133,109 @@ def test_a_result_is_not_reported_as_missed_while_it_may_not_be_due(make_executo
     jobs = [job.job for job in robot.jobs('detect')]
     assert sorted(miss.job for miss in missed if miss.kind != 'expired') == [
         job for job in sorted(jobs) if job % FINDS_IN == 0]
+
+
+FUSED = """
+mddag: 1
+nodes:
+  - node: /lidar
+    callbacks: [{name: read, timer: 30ms, publishes: [/points], dag: lidar}]
+  - node: /camera
+    callbacks: [{name: grab, timer: 20ms, publishes: [/image], dag: camera}]
+  - node: /detector
+    callbacks: [{name: detect, subscription: /image, publishes: [/boxes], deadline: 5s}]
+  - node: /fusion
+    callbacks:
+      - name: fuse
+        sync: {topics: [/boxes, /points], driven_by: /points}
+        publishes: [/obstacles]
+        may_publish: [/alarm]
+  - node: /brake
+    callbacks:
+      - {name: stop, subscription: /obstacles, deadline: 5s}
+      - {name: warn, subscription: /alarm, deadline: 5s}
+"""
+
+
+class Fusion:
+    """
+    Nodes of ``FUSED``: of three scans one is fused at once, one with the next boxes, one never.
+
+    Every sixth scan, which is fused at once, makes an alarm.
+    """
+
+    def __init__(self, make_node):
+        self.ran = {'obstacles': [], 'alarm': []}
+        self.waiting = None
+        self.nodes = {name: make_node(name) for name in (
+            'lidar', 'camera', 'detector', 'fusion', 'brake')}
+        self.topics = {
+            topic: self.nodes[node].create_publisher(Header, topic, 100) for node, topic in (
+                ('lidar', '/points'), ('camera', '/image'), ('detector', '/boxes'),
+                ('fusion', '/obstacles'), ('fusion', '/alarm'))}
+        numbers = count()
+        for node, topic, function in (
+                ('detector', '/image', lambda message: self.topics['/boxes'].publish(message)),
+                ('fusion', '/points', self.on_points), ('fusion', '/boxes', self.on_boxes),
+                ('brake', '/obstacles', partial(self.note, 'obstacles')),
+                ('brake', '/alarm', partial(self.note, 'alarm'))):
+            self.nodes[node].create_subscription(Header, topic, function, 100)
+        self.timers = [
+            self.nodes['lidar'].create_timer(0.03, lambda: self.topics['/points'].publish(
+                Header(frame_id=str(next(numbers)))), autostart=False),
+            self.nodes['camera'].create_timer(
+                0.02, lambda: self.topics['/image'].publish(Header()), autostart=False)]
+
+    def on_points(self, message):
+        number = int(message.frame_id)
+        self.waiting = message if number % 3 == 1 else None
+        if number % 3 == 0:
+            self.fuse(message)
+
+    def on_boxes(self, _):
+        if self.waiting is not None:
+            self.fuse(self.waiting)
+            self.waiting = None
+
+    def fuse(self, message):
+        if int(message.frame_id) % 6 == 0:
+            self.topics['/alarm'].publish(message)
+        self.topics['/obstacles'].publish(message)
+
+    def note(self, what, message):
+        self.ran[what].append((int(message.frame_id), current_job().job))
+
+
+def test_a_sync_of_two_rates(make_executor, make_node, tmp_path):
+    """A result belongs to the scan whichever topic's callback makes it, and is judged once."""
+    path = tmp_path / 'run.mcap'
+    robot = Fusion(make_node)
+    executor = make_executor(loads(FUSED), num_workers=2, trace=str(path))
+    for node in robot.nodes.values():
+        executor.add_node(node)
+    assert wait_for(lambda: all(each.get_subscription_count() for each in robot.topics.values()))
+    for timer in robot.timers:
+        timer.reset()
+    with Spinning(executor):
+        assert wait_for(lambda: any(n >= 24 and n % 3 == 0 for n, _ in robot.ran['obstacles']))
+        for timer in robot.timers:
+            timer.cancel()
+        assert wait_for(lambda: is_idle(executor))
+    executor.shutdown()
+    statistics = executor.statistics()
+    scans = statistics['dags']['lidar']['jobs']
+    assert all(n == job for each in robot.ran.values() for n, job in each) or scans > max(
+        n for n, _ in robot.ran['obstacles']) + 1     # a skipped release, on a busy machine
+    live = verdicts(statistics)
+    # scans that were never fused complete with the next one
+    assert live['/brake:stop'][0] > len(robot.ran['obstacles']) >= 9
+    assert statistics['unattributed'] == {'unknown': 0, 'doubtful': 0}
+    assert not any(each['unattributed'] for each in statistics['callbacks'].values())
+    assert live['/brake:warn'][0] + live['/brake:warn'][1] == live['/brake:stop'][0]
+    assert live['/brake:warn'][1] > 0
+    recorded = replay(path)
+    assert recorded.warnings == []
+    assert verdicts(recorded.result()) == live
+    # a timer that was cancelled while it waited runs there
+    completed, _, late, _ = verdicts(reschedule(path, workers=2).result())['/brake:stop']
+    assert (completed >= live['/brake:stop'][0], late) == (True, 0)

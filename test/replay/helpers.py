@@ -10,13 +10,16 @@ records, in the order in which it does: what a thread ran only when it has run.
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from functools import partial
 from heapq import heappop, heappush
 from itertools import count
 from pathlib import Path
 import random
+from typing import NamedTuple
 
 from hypothesis import strategies as st
 from mddag_executor.core import legs_of, Scheduler, Tables, Tally
+from mddag_executor.core.driven import Awaiting
 from mddag_executor.core.state import (
     DROP,
     EXPIRED,
@@ -82,7 +85,10 @@ def declarations(draw):
 
     for d in range(draw(st.integers(1, 3))):
         n = draw(st.integers(1, 6))
-        before = [[], *(sorted(draw(st.sets(st.integers(0, i - 1), min_size=1, max_size=3)))
+        # a sync of all, after one of different rates, would depend on which leg is not published
+        driven = draw(st.booleans())
+        most = 1 if driven else 3
+        before = [[], *(sorted(draw(st.sets(st.integers(0, i - 1), min_size=1, max_size=most)))
                         for i in range(1, n))]
         publishing = {p for row in before for p in row}
         publisher = draw(st.integers(0, n - 1)) if shared else -1
@@ -90,6 +96,8 @@ def declarations(draw):
             topics = [f'/d{d}t{i}'] * (i in publishing) + ['/shared'] * (i == publisher)
             heard = ', '.join(f'/d{d}t{p}' for p in before[i])
             start = f'sync: [{heard}]' if len(before[i]) > 1 else f'subscription: {heard}'
+            if i and driven and draw(st.booleans()):
+                start = f'sync: {{topics: [/outside, {heard}], driven_by: {heard}}}'
             if i == 0:
                 start = f'timer: 10ms, dag: dag{d}' + (
                     ', max_active_jobs: 2' if draw(st.booleans()) else '')
@@ -126,7 +134,7 @@ def withhold(task_set, scheduler, slot, vertex, published, now):
         for after, topic in optional_edges(
                 task_set.vertices[vertex], task_set.dags[dag].vertices):
             if topic not in published:
-                scheduler.withhold(slot, first + after, now)
+                scheduler.withhold(slot, vertex, first + after, now)
 
 
 def ns(ms):
@@ -193,6 +201,13 @@ class Chances:
     silent: float = 0.3
 
 
+class _Job(NamedTuple):
+    slot: int
+    dag: int
+    job: int
+    vertex: int
+
+
 @dataclass
 class _Execution:
     x: int
@@ -204,6 +219,8 @@ class _Execution:
     ready: int
     pieces: int = 1
     silent: frozenset[str] | None = None
+    sync: str | None = None     # of a driven sync: its callback
+    answers: _Job | None = None
 
 
 @dataclass
@@ -232,10 +249,12 @@ class VirtualRun:
         self.responses = []
         self._targets = legs_to(self.task_set, self.tables)
         self._queue, self._order = [], count()
-        self._waiting = {}
+        self._waiting, self._running = {}, {}
         self._published = defaultdict(set)
         self._optional = {topic: 9000 + place for place, topic in enumerate(sorted(
             {topic for each in self.task_set.callbacks for topic in each.may_publish}))}
+        self._awaiting = {each.key: Awaiting(each) for each in self.task_set.callbacks
+                          if each.driven_by is not None}
         self._jobs = [0] * self.tables.n_dags
         self._events = self.drops = 0
         self.file = TraceFile(self.path, overwrite=True)
@@ -251,6 +270,10 @@ class VirtualRun:
             for k in range(self.duration // dag.period_ns):
                 release = START_TIME + (k + 1) * dag.period_ns
                 self._at(release + self.random.randrange(MS), self._release(dag.index, release))
+        for key in self._awaiting:
+            for _ in range(self.random.choice([0, 3, 30])):
+                self._at(START_TIME + self.random.randrange(self.duration),
+                         partial(self._undeclared, sync=key))
         if self.random.random() < self.chances.undeclared:
             for _ in range(20):
                 self._at(START_TIME + self.random.randrange(self.duration), self._undeclared)
@@ -258,6 +281,9 @@ class VirtualRun:
             now, _, action = heappop(self._queue)
             action(now)
             self._dispatch(now)
+        for work, worker, start in self._running.values():  # as the executor does: they go on
+            if work.vertex >= 0 and work.sync is not None:
+                self._record_dispatch(work, worker, start)
         if self.shut_down:
             self.scheduler.expire_idle(end)
             self.decided(end)
@@ -306,10 +332,15 @@ class VirtualRun:
                     self.tables.index_in_dag[vertex], job, reason)
         self.drops += 1
 
-    def _undeclared(self, now):
+    def _undeclared(self, now, sync=None):
         self.undeclared_runs += 1
         x = self.scheduler.ready_undeclared(self.undeclared_runs, -1, 0, -1, now)
-        self._waiting[x] = _Execution(x, -1, 0, -1, -1, -1, now)
+        self._waiting[x] = _Execution(x, -1, 0, -1, -1, -1, now, sync=sync)
+
+    def _is_open(self, job):
+        state = self.scheduler.state
+        return (state.job_dag[job.slot] == job.dag and state.job_index[job.slot] == job.job
+                and state.job_state[job.slot] == OPEN)
 
     def _message(self, slot, dag, job, vertex, leg):
         def action(now):
@@ -338,30 +369,64 @@ class VirtualRun:
         end = start + self.random.randrange(1, self.longest)
         self._at(end + self.random.choice((0, 0, 1, 30_000)),
                  lambda locked: self._end(work, worker, start, end, locked))
-        if work.vertex >= 0:
-            if work.silent is None:
-                callback = self.task_set.vertices[work.vertex].callback
-                work.silent = frozenset(topic for topic in callback.may_publish
+        self._running[work.x] = work, worker, start
+        by = work
+        if work.vertex >= 0 and work.silent is None:
+            callback = self.task_set.vertices[work.vertex].callback
+            work.sync = callback.key if callback.driven_by else None
+            work.silent = frozenset(
+                topic for topic in (callback.publishes if work.sync else callback.may_publish)
+                if self.random.random() < self.chances.silent)
+        if work.sync is not None and work.pieces == 1:
+            awaiting, callback = self._awaiting[work.sync], self.task_set.callback(work.sync)
+            awaiting.hear(callback.driven_by if work.vertex >= 0 else '/outside')
+            if work.vertex >= 0:
+                work.answers = _Job(work.slot, work.dag, work.job, work.vertex)
+                awaiting.receive(work.answers)
+            else:
+                work.answers = awaiting.newest(self._is_open)
+                work.silent = frozenset(t for t in callback.publishes
                                         if self.random.random() < self.chances.silent)
-            for vertex, leg in self._targets[work.vertex]:
+        if work.sync is not None:
+            by = work.answers
+        if by is not None and by.vertex >= 0:
+            for vertex, leg in self._targets[by.vertex]:
                 if self._topic(vertex, leg) in work.silent:
                     continue
                 if self.random.random() >= self.chances.lost:
                     early = self.random.random() < self.chances.early_message
                     arrival = self.random.randrange(start, end + 1) if early \
                         else end + 100_000 + self.random.randrange(2 * MS)
-                    self._at(arrival, self._message(work.slot, work.dag, work.job, vertex, leg))
+                    self._at(arrival, self._message(by.slot, by.dag, by.job, vertex, leg))
+
+    def _answered(self, work, fails):
+        """Return the jobs that an execution of a driven sync completes, as the engine does."""
+        awaiting = self._awaiting[work.sync]
+        published = {*self.task_set.callback(work.sync).publishes} - work.silent
+        if fails or work.answers is None or not (
+                self._is_open(work.answers) and awaiting.is_answer(published)):
+            return []
+        return [each for each in awaiting.answer(work.answers) if self._is_open(each)]
 
     def _end(self, work, worker, start, end, now):
         vtid = 100 + worker
+        fails, completes = False, []
+        if work.sync is not None:
+            fails = work.vertex >= 0 and self.random.random() < self.chances.failed
+            completes = self._answered(work, fails)
+        x = work.x
+        del self._running[x]
+        if completes and work.vertex < 0:
+            work.slot, work.dag, work.job, work.vertex = completes[0]
         declared = work.vertex >= 0
         address = self._address(work.vertex)
         vertex = self.tables.index_in_dag[work.vertex] if declared else -1
-        self.record('dispatch', start, vtid, address, work.dag, vertex, work.job, worker,
-                    work.ready, 0)
+        self._record_dispatch(work, worker, start)
         self.record('callback_start', start, vtid, address, False)
         if declared:
             published = self._published[work.dag, work.job, work.vertex]
+            if work.sync is not None:
+                published = set()
             for topic in self.task_set.vertices[work.vertex].callback.may_publish:
                 if topic not in work.silent:
                     published.add(topic)
@@ -372,21 +437,35 @@ class VirtualRun:
             self.busy[key] += end - start
             if work.pieces == 1:
                 self.waited[key] += start - work.ready
-        if declared and self.random.random() < self.chances.coroutine:
+        if declared and work.sync is None and self.random.random() < self.chances.coroutine:
             self.scheduler.suspend(work.x)
             self._at(now + self.random.randrange(MS), lambda later: self._resume(work, later))
             return
-        if declared and self.random.random() < self.chances.failed:
+        if work.sync is None:
+            fails = declared and self.random.random() < self.chances.failed
+        if fails:
             self.scheduler.give_up(work.slot, FAILED, end)
             self.record('fail', now, vtid, work.dag, vertex, work.job)
+        elif work.sync is not None:
+            for each in completes:
+                withhold(self.task_set, self.scheduler, each.slot, each.vertex, published, end)
         elif declared:
             withhold(self.task_set, self.scheduler, work.slot, work.vertex, published, end)
-        whole = self.scheduler.complete(work.x, end)
+        whole = self.scheduler.complete(x, end)
+        if work.sync is not None:
+            whole = bool(completes)
+            for each in completes:
+                self.scheduler.answer(each.slot, each.vertex, completes[0].slot, end)
         if declared:
             self.executions[key] += 1
             self.record('complete', now, vtid, address, work.dag, vertex, work.job, whole, end,
                         work.leg)
         self.decided(now)
+
+    def _record_dispatch(self, work, worker, start):
+        vertex = self.tables.index_in_dag[work.vertex] if work.vertex >= 0 else -1
+        self.record('dispatch', start, 100 + worker, self._address(work.vertex), work.dag, vertex,
+                    work.job, worker, work.ready, 0)
 
     def _topic(self, vertex, leg):
         vertex = self.task_set.vertices[vertex]

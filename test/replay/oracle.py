@@ -8,9 +8,9 @@ from mddag_executor.core import NEVER, Scheduler, Tables, Tally
 from mddag_executor.core import state as core
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.rules import complete
-from mddag_executor.core.state import IDLE, JOB_END, OPEN, SKIP
-from mddag_executor.core.tables import CONTINUE
-from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED
+from mddag_executor.core.state import DONE, IDLE, JOB_END, OPEN, SKIP
+from mddag_executor.core.tables import CONTINUE, DRIVEN
+from mddag_executor.recording.tables import ABORTED, ALL_LEGS, EXPIRED, FAILED, VERTEX
 
 from .helpers import withhold
 
@@ -36,18 +36,25 @@ class Oracle:
         self.slots = {}
         self.task_set = task_set
         self.published = defaultdict(set)
+        self.published_by = defaultdict(set)
         sent, publishers = recording.publications, recording.who.every_publisher
         for publisher, by in sent[['publisher', 'execution']].tolist():
             if by >= 0 and publisher in publishers:
                 ran = recording.executions[by]
-                self.published[int(ran['vertex']), int(ran['job'])].add(
-                    publishers[publisher].topic)
+                topic = publishers[publisher].topic
+                self.published[int(ran['vertex']), int(ran['job'])].add(topic)
+                self.published_by[int(ran['order'])].add(topic)
         events = [(order, 0, (dag, job, release, noticed)) for _, dag, job, release, noticed, order
                   in recording.releases.tolist()]
-        columns = ('order', 'dag', 'vertex', 'job', 'leg', 'end')
+        #: By driven sync and job when its driving message was received.
+        self.received = {}
+        for v, job, start in recording.executions[['vertex', 'job', 'start']].tolist():
+            if v >= 0 and start >= 0 and task_set.vertices[v].callback.driven_by is not None:
+                self.received[v, job] = min(start, self.received.get((v, job), NEVER))
+        columns = ('order', 'dag', 'vertex', 'job', 'leg', 'end', 'completes')
         done = recording.executions[
             (recording.executions['completes'] > 0) & (recording.executions['vertex'] >= 0)]
-        events += [(order, 1, row) for order, *row in done[list(columns)].tolist()]
+        events += [(order, 1, (*row, order)) for order, *row in done[list(columns)].tolist()]
         events += [(order, 2, (dag, job, time, reason)) for _, dag, _, job, time, reason, order
                    in recording.job_ends.tolist()]
         events += [(order, 3, (dag, here)) for order, dag, here in recording.hosted]
@@ -67,9 +74,13 @@ class Oracle:
         if is_judged(self.scheduler.state, slot):
             self.tally.released(dag)
 
-    def completed(self, dag, vertex, job, leg, end):
+    def completed(self, dag, vertex, job, leg, end, completes, order):
         state, tables = self.scheduler.state, self.tables
         legs = range(tables.n_legs[vertex]) if leg == ALL_LEGS else [leg]
+        if tables.driven[vertex] & DRIVEN:
+            if completes == VERTEX:
+                self.answered(dag, vertex, job, end, order)
+            return
         for each in legs:
             slot = self.slots.get((dag, job))
             if slot is None or state.job_state[slot] != OPEN:
@@ -80,6 +91,26 @@ class Oracle:
                 withhold(self.task_set, self.scheduler, slot, vertex,
                          self.published[vertex, job], end)
                 complete(tables, state, self.scheduler.policy.key, x, end)
+
+    def answered(self, dag, vertex, job, end, order):
+        """Complete a driven sync in a job, and in those of earlier driving messages."""
+        slot = self.slots.get((dag, job))
+        if slot is None or self.scheduler.state.job_state[slot] != OPEN:
+            return
+        x = self.scheduler.execution(slot, vertex)
+        if self.scheduler.state.x_pending[x] < 0:
+            return
+        self.scheduler.state.x_state[x] = DONE
+        received = self.received[vertex, job]
+        before = [self.slots[dag, other] for (v, other), at in self.received.items()
+                  if v == vertex and at < received and (dag, other) in self.slots]
+        for each in (slot, *before):
+            x = self.scheduler.execution(each, vertex)
+            if self.scheduler.state.x_pending[x] >= 0:
+                withhold(
+                    self.task_set, self.scheduler, each, vertex, self.published_by[order], end)
+        for each in (slot, *before):
+            self.scheduler.answer(each, vertex, slot, end)
 
     def ended(self, dag, job, time, reason):
         slot = self.slots.get((dag, job))

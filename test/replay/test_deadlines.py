@@ -32,7 +32,10 @@ def check(recording, skip=0):
     expected = [each for each in oracle.decisions
                 if each[0] not in (JOB_END, DROP, SINK_NOT_DUE)]
     columns = ('kind', 'dag', 'sink', 'job', 'deadline', 'completed')
-    assert judged.verdicts[list(columns)].tolist() == expected
+    found = judged.verdicts[list(columns)].tolist()
+    if any(callback.driven_by for callback in recording.task_set.callbacks):
+        found, expected = sorted(found), sorted(expected)   # one execution completes several jobs
+    assert found == expected
 
 
 @given(st.integers(0, 2**32), st.data())
@@ -111,7 +114,7 @@ def check_parts(recording, borders):
 def check_rows(whole, part, begin, end):
     """All that ran within the part is in it, and rows refer to what they did."""
     ran = whole.executions
-    inside = ran[(ran['start'] >= begin) & (ran['end'] < end) & (ran['start'] >= 0)]
+    inside = ran[(ran['start'] >= begin) & (ran['start'] < end) & (ran['end'] < end)]
     columns = ['callback', 'dag', 'vertex', 'job', 'start', 'end', 'worker', 'completes']
     missing = set(inside[columns].tolist()).difference(part.executions[columns].tolist())
     assert not missing
