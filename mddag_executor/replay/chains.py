@@ -20,7 +20,7 @@ first link is the source.  The response time (completion minus release) is the s
 * unknown: the time before the first recorded link.
 
 An execution of a driven sync (``driven_by``) may have been ready before the driving message was
-published.  It waits for the job from then on.
+published.  Its waiting counts from that publication.
 
 A vertex has one execution in a job: the one that completed it, otherwise the last one that started
 before the job ended.  If that one never completed, it is unknown when it ended and which message
