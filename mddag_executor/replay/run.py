@@ -91,7 +91,7 @@ def _bag(path: str, task_set: TaskSet | None, name: str) -> Recording:
         raise ReplayError(
             name, 'it is an ordinary bag: nothing in it says which callbacks its messages start',
             'give the GRAPH')
-    from mddag_executor.replay.bags_reschedule import read_bag
+    from mddag_executor.replay.bag_run import read_bag
     return read_bag(path, task_set, name)
 
 

@@ -12,8 +12,9 @@ from mcap.writer import Writer as McapWriter
 from mddag_executor import open_recording
 from mddag_executor.errors import InputError
 from mddag_executor.replay import replay, ReplayError, reschedule
+from mddag_executor.replay.bag_run import read_bag
 from mddag_executor.replay.bags import Bag, BagError, is_ordinary, UNKNOWN
-from mddag_executor.replay.bags_reschedule import read_bag, reschedule_bag
+from mddag_executor.replay.bags_reschedule import reschedule_bag
 from mddag_executor.simulate import START
 from mddag_executor.trace import blocks, times, TraceError, TraceFile
 from msg_graph import loads
