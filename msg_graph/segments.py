@@ -55,12 +55,13 @@ def hops(task_set: TaskSet, path: Path) -> list[Hop]:
 
 
 def _hop(before: Callback, after: Callback) -> Hop:
-    topics = frozenset(before.publishes).intersection(after.topics)
+    topics = frozenset(before.publishes).intersection(after.triggers)
     if topics:
         return Hop('trigger', topics)
     if before.node == after.node and before.name in after.reads:
         return Hop('variable', frozenset())
-    return Hop('topic', frozenset(before.publishes).intersection(after.reads))
+    return Hop('topic', frozenset(before.publishes).intersection(
+        after.reads + after.other_topics))
 
 
 class Segment(NamedTuple):

@@ -68,6 +68,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         Part.make(folder, task_set.text, common_options)
         names = [process.name for process in task_set.processes]
         _warn_of_contested(task_set)
+        _warn_of_divided_paths(task_set)
         for name in names:
             common.check_output(
                 _trace(args.trace, name), recording=True, overwrite=args.overwrite)
@@ -120,6 +121,13 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
             args, result):
         raise error
     return status
+
+
+def _warn_of_divided_paths(task_set: TaskSet) -> None:
+    from mddag_executor.executor.path_watch import divided
+    for name in divided(task_set):
+        warn(f'path {name}: its callbacks run in several processes, so this run leaves it out: '
+             'record it with --trace, and judge it with mddag replay')
 
 
 def _warn_of_contested(task_set: TaskSet) -> None:

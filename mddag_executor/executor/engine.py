@@ -61,6 +61,7 @@ from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity, SUBSCRIPTION, TIMER
 from mddag_executor.executor.jobs import Announced, Jobs, NO_ORIGIN, Origin
 from mddag_executor.executor.other_processes import OtherProcesses
+from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
 from mddag_executor.trace.groups import EXECUTION
 from mddag_executor.trace.schema import GOES_ON
@@ -99,6 +100,9 @@ class Engine:
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.jobs = Jobs(task_set)
+        #: Judges what is required of paths; None: nothing is.
+        self.path_watch = PathWatch(task_set, process) if task_set is not None and any(
+            path.requirements for path in task_set.paths) else None
         # by vertex: the vertices that it may start, each with the topic that does
         self._optional_edges: dict[int, list[tuple[int, str]]] = {}
         for dag in task_set.dags if task_set else ():
@@ -137,6 +141,7 @@ class Engine:
         self._work: dict[int, Work] = {}
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
+        self._ended = NEVER
         #: whether a callback pauses while a more urgent one overtakes it
         self.pauses = False
         # executions that hold the GIL, in the order in which they began; read-only outside
@@ -679,9 +684,10 @@ class Engine:
         if entity.awaiting is not None:
             completes = [] if failed else self._answered(work)
             origin = completes[0] if completes else origin
+        published: dict[Origin, set[str] | None] = {}
         for each in completes:
             if each.vertex in self._optional_edges:
-                self._withhold(work, each, failed, end)
+                published[each] = self._withhold(work, each, failed, end)
         if self.verdicts.tally.overdue:
             for each in completes:
                 deadline = self.verdicts.tally.overdue.get((each.vertex, each.job), -1)
@@ -696,6 +702,12 @@ class Engine:
         if origin is not None:
             tables, state = self.tables, self._state
             slot, dag, job, vertex = origin
+            if self.path_watch is not None and (whole or tables.n_legs[vertex] == 1):
+                for each in completes:
+                    if each.vertex in self.path_watch.vertices:
+                        self.path_watch.ended(
+                            each.vertex, each.job, start, end,
+                            None if failed else published.get(each), state.scalars[JUDGE_FROM])
             leg = 0 if entity.may_answer else (
                 x - state.job_base[slot] - tables.region_offset[vertex])
             if record is not None:
@@ -712,12 +724,18 @@ class Engine:
         if self._state.decisions:
             self._decided(now)
 
-    def _withhold(self, work: Work, origin: Origin, failed: bool, now: int) -> None:
-        """Leave out of a job what an execution that ends might have started, but has not."""
+    def _withhold(
+        self, work: Work, origin: Origin, failed: bool, now: int
+    ) -> set[str] | None:
+        """
+        Leave out of a job what an execution that ends might have started, but has not.
+
+        :return: its published topics of ``may_publish``; None: a leg that was not the last.
+        """
         slot, _, _, vertex = origin
         pending = self._state.x_pending[self.scheduler.execution(slot, vertex)]
         if pending > 1:
-            return  # a leg of a sync that was not the last
+            return None     # a leg of a sync that was not the last
         published = self.jobs.published(origin)
         if work.entity.awaiting is not None:
             published = set(work.published)
@@ -725,6 +743,7 @@ class Engine:
             for after, topic in self._optional_edges[vertex]:
                 if topic not in published:
                     self.scheduler.withhold(slot, vertex, after, now)
+        return published
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
@@ -836,6 +855,11 @@ class Engine:
         if self.record is not None:
             self.record('judge_from', now, get_native_id(), release)
 
+    def requirements(self, now: int) -> dict[str, Any]:
+        """Return the results of what is required of paths, see ``PathWatch.result``."""
+        return {} if self.path_watch is None else self.path_watch.result(
+            min(now, self._ended), self._state.scalars[JUDGE_FROM])
+
     def judge_overdue(self, now: int) -> None:
         """Report the sinks whose deadlines are over and which have not completed."""
         if self._finished:
@@ -897,6 +921,7 @@ class Engine:
             ended since, but later deadlines are not judged.
         """
         end = now if end is None else end
+        self._ended = end
         if self.record is not None:
             self._record_waiting(now)
         self.scheduler.expire_idle(end)

@@ -26,6 +26,7 @@ def statistics(
         waiting = engine.queue_length
         idle = engine.idle_workers
         undeclared = engine.undeclared
+        requirements = engine.requirements(pool.clock.now())
         elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
     elsewhere |= registry.elsewhere(process)
     callbacks = cast('dict[str, CallbackCounts]', registry.counts())
@@ -39,7 +40,8 @@ def statistics(
         'policy': engine.scheduler.policy.name, 'on_late': engine.on_late,
         'workers': engine.n_workers,
         'deadline_missed': result['deadline_missed'], 'first_miss': result['first_miss'],
-        'never_due': never_due(result['dags']), 'dags': result['dags'], 'stops': stops,
+        'never_due': never_due(result['dags']), 'dags': result['dags'],
+        'requirements': requirements, 'stops': stops,
         'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,

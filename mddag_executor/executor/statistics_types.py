@@ -9,7 +9,7 @@ ns; names of callbacks and sinks are ``/node:callback``.
 
 from __future__ import annotations
 
-from typing import TypedDict
+from typing import Any, TypedDict
 
 ResponseTimes = TypedDict(  # noqa: UP013 - a class would shadow min and max
     'ResponseTimes', {'min': int, 'median': int, 'p99': int, 'max': int})
@@ -143,7 +143,9 @@ class Statistics(TypedDict):
     ``never_due`` lists sinks without a due job, ``never_ran`` declared callbacks that have not
     run. ``unreported_misses`` counts misses that ``on_deadline_miss`` was too slow for.
     ``undeclared`` counts executions of undeclared callbacks; ``queue`` counts ready executions
-    that wait; ``lent`` counts how often a waiting callback has lent its worker.
+    that wait; ``lent`` counts how often a waiting callback has lent its worker.  ``requirements``
+    has by path, and 'reaction' or 'age', counts in the format of a sink; it is empty if nothing is
+    required.
     """
 
     policy: str
@@ -153,6 +155,7 @@ class Statistics(TypedDict):
     first_miss: FirstMiss | None
     never_due: list[str]
     dags: dict[str, DagCounts]
+    requirements: dict[str, Any]
     stops: Stops
     callbacks: dict[str, CallbackCounts]
     undeclared: int

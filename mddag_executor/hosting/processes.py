@@ -341,6 +341,8 @@ def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
             add_counts(callbacks, name, counts)
     return {
         **of_processes(task_set, results),
+        'requirements': {name: each for part in parts
+                         for name, each in part['requirements'].items()},
         'stops': {key: sum(part['stops'][key] for part in parts)
                   for key in ('count', 'total_ns', 'misses')},
         'callbacks': callbacks,

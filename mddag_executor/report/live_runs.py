@@ -13,6 +13,7 @@ from mddag_executor.report.tables import (
     drift_lines,
     never_due_lines,
     percent,
+    requirement_table,
     sink_table,
     verdicts_line,
 )
@@ -24,6 +25,8 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
     """Yield the table of a run's sinks (there is none without a declaration), and the lines."""
     if result['dags']:
         yield sink_table(result['dags'])
+        if result['requirements']:
+            yield requirement_table(result['requirements'])
         yield verdicts_line(result['dags'])
     else:
         yield 'no declaration was given, so no deadline was judged'

@@ -21,6 +21,56 @@ from ..conftest import run_program, wait_for_run
 from . import golden
 from .declared import GRAPH
 
+SENSED = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /imu
+    callbacks:
+      - {name: sample, timer: 10ms, publishes: [/imu], execution_time: 1ms}
+  - node: /fuse
+    callbacks:
+      - {name: on_imu, subscription: /imu, deadline: 10ms, execution_time: 1ms}
+      - {name: estimate, timer: 20ms, reads: [on_imu], publishes: [/pose], execution_time: 2ms}
+  - node: /wheels
+    callbacks: [{name: drive, subscription: /pose, deadline: 20ms, execution_time: 1ms}]
+paths:
+  - name: imu_to_wheels
+    callbacks: ['/imu:sample', '/fuse:on_imu', '/fuse:estimate', '/wheels:drive']
+    reaction: 40ms
+    age: 20ms
+"""
+
+
+def test_a_run_judges_paths_as_its_replay_does(folder, mddag):
+    Path('g.yaml').write_text(SENSED)
+    run = mddag('run', 'g.yaml', '--synthetic', 'sleep', '--duration', '1s', '--trace', 'r.mcap',
+                '--json', 'live.json')
+    assert run.returncode == 0, run.stderr
+    assert re.search('^imu_to_wheels reaction +[1-9]', run.stdout, re.MULTILINE)
+    found = json.loads(Path('live.json').read_text())['requirements']
+    assert found['imu_to_wheels']['reaction']['completed'] > 20
+    again = json.loads(mddag('replay', 'r.mcap', '--json', '-').stdout)['requirements']
+    # one more or less, if a thread was interrupted between an end and its report
+    for what, each in found['imu_to_wheels'].items():
+        for count in ('completed', 'late'):
+            assert each[count] == pytest.approx(
+                again['imu_to_wheels'][what][count], rel=0.1, abs=3)
+
+
+def test_a_path_over_several_processes_is_left_to_the_replay(folder, mddag):
+    Path('g.yaml').write_text(SENSED)
+    run = mddag('run', 'g.yaml', '--synthetic', 'sleep', '--duration', '1s', '--processes', '2',
+                '--trace', 'r.mcap', '--json', 'live.json')
+    assert run.returncode == 0, run.stderr
+    assert ('warning: path imu_to_wheels: its callbacks run in several processes, so this run '
+            'leaves it out: record it with --trace, and judge it with mddag replay'
+            ) in run.stderr.splitlines()
+    assert json.loads(Path('live.json').read_text())['requirements'] == {}
+    traces = sorted(map(str, Path().glob('r*.mcap')))
+    again = mddag('replay', *traces, '--json', '-')
+    assert json.loads(again.stdout)['requirements']['imu_to_wheels']['age']['completed'] > 10
+
 
 def test_a_synthetic_run_is_counted_measured_and_recorded(graph, mddag):
     process = mddag(

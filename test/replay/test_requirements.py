@@ -4,16 +4,21 @@
 
 import json
 from pathlib import Path
+import random
 import re
 
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_NOT_DUE
+from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.recording.tables import Recording
 from mddag_executor.replay import replay
+from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.replay.paths import Flows
-from mddag_executor.replay.requirements import Requirements
+from mddag_executor.replay.requirements import of_computed, Requirements
+from mddag_executor.simulate import draw_execution_times, periodic_load, Settings, simulate
 from msg_graph import loads
+from msg_graph.segments import bound, segments
 import numpy as np
 import pytest
 
@@ -211,3 +216,76 @@ def test_reactions_are_those_of_slow_rules(flows, sampled, required, until):
         flows, sampled, required, until)
     for _, _, ended, step in table.tolist():
         assert ended == -1 or end[step] == ended
+
+
+# --- random systems, simulated ---------------------------------------------------------------
+
+def random_system(chance):
+    """Return a declaration: chains of callbacks, each of which reads what the one before wrote."""
+    lines, callbacks = ['mddag: 1', f'workers: {chance.randint(1, 3)}', 'nodes:'], []
+    reads = ''
+    for segment in range(chance.randint(1, 3)):
+        period = chance.choice((10, 20, 33, 50))
+        length = chance.randint(1, 3)
+        for place in range(length):
+            start = f'timer: {period}ms' if not place else f'subscription: /s{segment}t{place}'
+            ends = place == length - 1
+            deadline = max(1, int(period * chance.uniform(0.3, 1.5)))
+            end = f'deadline: {deadline}ms' if ends else f'publishes: [/s{segment}t{place + 1}]'
+            if ends and chance.random() < 0.5:
+                end += f', publishes: [/s{segment}out]'
+            cost = chance.randint(50, 2000)
+            lines.append(
+                f'  - {{node: /s{segment}n{place}, callbacks: [{{name: cb, {start}, group: g, '
+                f'{end}{reads if not place else ""}, execution_time: {cost}us}}]}}')
+            callbacks.append(f"'/s{segment}n{place}:cb'")
+            if ends and 'publishes' not in end:
+                return '\n'.join([*lines, *path_of(callbacks)])
+        reads = f', reads: [/s{segment}out]'
+    return '\n'.join([*lines, *path_of(callbacks)])
+
+
+def path_of(callbacks):
+    if len(callbacks) < 2:
+        return []
+    return ['paths:', f'  - {{name: p, callbacks: [{", ".join(callbacks)}], reaction: 40ms, '
+            'age: 30ms}']
+
+
+def simulated_run(task_set):
+    settings = Settings(workers=task_set.workers, duration_ns=600 * MS)
+    load = periodic_load(task_set, draw_execution_times(task_set, 0), settings.duration_ns)
+    run = simulate(task_set, load, settings, log=True)
+    return run.result(), ComputedRun.of_run(task_set, load, run)
+
+
+def watched(task_set, recording):
+    """Return what the executor would find in a run."""
+    watch = PathWatch(task_set, None)
+    rows = recording.executions
+    done = np.flatnonzero((rows['end'] >= 0) & (rows['start'] >= 0))
+    for row in sorted(done.tolist(), key=lambda row: (rows['end'][row], rows['start'][row])):
+        vertex = int(rows['vertex'][row])
+        if vertex in watch.vertices:
+            watch.ended(vertex, int(rows['job'][row]), int(rows['start'][row]),
+                        int(rows['end'][row]), None, -2 ** 62)
+    return watch.result(recording.judged_until, -2 ** 62)
+
+
+@pytest.mark.parametrize('seeds', [
+    range(40), pytest.param(range(40, 1040), marks=pytest.mark.nightly)])
+def test_live_verdicts_and_bounds_in_random_systems(seeds):
+    bounded = 0
+    for seed in seeds:
+        task_set = loads(random_system(random.Random(seed)), f'{seed}.yaml')
+        result, run = simulated_run(task_set)
+        found = of_computed(run)
+        if not found:
+            continue
+        assert watched(task_set, run.recording()) == found['requirements'], seed
+        for what, each in found['requirements']['p'].items():
+            if not result['deadline_missed'] and each['response_ns'] is not None:
+                limit = bound(task_set, task_set.paths[0], what)
+                assert each['response_ns']['max'] <= limit, (seed, what)
+                bounded += len(segments(task_set, task_set.paths[0])) > 1
+    assert bounded > len(seeds) // 4
