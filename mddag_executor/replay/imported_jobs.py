@@ -27,13 +27,18 @@ Events are named by their position in the order of time.
 4. *Several messages of an execution.*  If an execution publishes a topic several times, the
    callbacks after it run several times in the job.  A vertex completes with the last of them; the
    earlier ones count like messages of a sync that are only stored (`LEG`).
+5. *Driven syncs* (`driven_by`).  The message of the driving topic belongs to a job; the execution
+   that answers it (`core.driven`) completes the vertex, and belongs to the job as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from mddag_executor.core import EXPIRE_AFTER_NS, legs_of, Tables
+from mddag_executor.core.driven import Awaiting
+from mddag_executor.core.tables import DRIVEN
 from mddag_executor.recording.columns import rows, Table
 from mddag_executor.recording.mapping import Target
 from mddag_executor.recording.tables import (
@@ -60,6 +65,13 @@ _ANY = -2
 """Instead of a vertex: any of them."""
 
 
+class _Job(NamedTuple):
+    """A job as one vertex: the vertex, and the row of its release."""
+
+    vertex: int
+    row: int
+
+
 class ImportedJobs:
     """
     The jobs of an imported recording.
@@ -81,6 +93,11 @@ class ImportedJobs:
         self._declared = np.array([
             UNKNOWN if each is None else self._vertices[each.callback.key]
             for each in targets], dtype=np.int64)
+        #: By callback whether it is of a driven sync, for a topic that does not drive it.
+        self._is_other = np.array([
+            each is not None and each.topic in each.callback.other_topics for each in targets],
+            dtype=np.bool_)
+        self._targets = targets
         self._index(targets)
         runs = links.runs
         source = self._source[runs['callback']]
@@ -96,6 +113,8 @@ class ImportedJobs:
         self._row, self._vertex = np.full((2, len(runs)), UNKNOWN)
         self._row[self.sources], self._vertex[self.sources] = np.arange(len(dag)), source
         self._leg = np.zeros(len(runs), dtype=np.int64)
+        #: By run whether it answers a job, if it is of a driven sync.
+        self._answers = np.zeros(len(runs), dtype=np.bool_)
         self._follow_messages()
 
     def _index(self, targets: Sequence[Target | None]) -> None:
@@ -108,6 +127,8 @@ class ImportedJobs:
         for dag, begin in zip(self._dags, self._tables.first_vertex):
             for vertex in dag.vertices:
                 mine = self._declared == self._vertices[vertex.callback.key]
+                if vertex.callback.driven_by is not None:
+                    mine &= ~self._is_other
                 if vertex.index == dag.source:
                     self._source[mine] = begin + vertex.index
                 for leg, (topic, before) in enumerate(legs_of(vertex, dag.vertices)):
@@ -120,7 +141,7 @@ class ImportedJobs:
         sender = np.append(sent, UNKNOWN)[runs['message']]
         here, callback = np.arange(len(runs)), runs['callback']
         mine = (self._declared[callback] >= 0) & (self._source[callback] < 0) & (
-            self._first == here)
+            self._first == here) & ~self._is_other[callback]
         # no message is received before it was published: clocks differ, or times are damaged
         self._distrusted = self._distrusted | (sender >= here)
         #: Executions of an unknown job.
@@ -131,13 +152,53 @@ class ImportedJobs:
             vertex = self._after[self._vertex[cause], callback[todo]]
             found = vertex >= 0
             if not found.any():
-                break
+                if not self._answer():
+                    break
+                continue
             new, cause = todo[found], cause[found]
             self._vertex[new], self._row[new] = vertex[found], self._row[cause]
             self._leg[new] = self._leg_of[self._vertex[cause], callback[new]]
             todo = todo[~found]
+        self._answer()
         for column in (self._vertex, self._row, self._leg):
             column[:] = column[self._first]
+
+    def _answer(self) -> bool:
+        """Find the executions that answer driven syncs (rule 5); return whether there are more."""
+        before = int(self._answers.sum())
+        runs, messages = self._links.runs, self._links.messages
+        names = [*self._links.topics, '']
+        for callback in {each.callback.key: each.callback for each in self._targets
+                         if each is not None and each.callback.driven_by is not None}.values():
+            mine = np.array([each is not None and each.callback.key == callback.key
+                             for each in self._targets], dtype=np.bool_)[runs['callback']]
+            mine &= self._first == np.arange(len(runs))
+            sent = np.flatnonzero((messages['run'] >= 0) & mine[messages['run']])
+            published: dict[int, set[str]] = {}
+            for run, topic in zip(messages['run'][sent].tolist(),
+                                  self._links.topic_of[sent].tolist()):
+                published.setdefault(run, set()).add(names[topic])
+            which = np.flatnonzero(mine)
+            times = [*zip(runs['at'][which].tolist(), which.tolist(), [True] * len(which)),
+                     *zip(runs['end_at'][which].tolist(), which.tolist(), [False] * len(which))]
+            awaiting: Awaiting[_Job] = Awaiting(callback)
+            job_of: dict[int, _Job | None] = {}
+            for at, run, starts in sorted(times):
+                target = self._targets[runs['callback'][run]]
+                is_other = bool(self._is_other[runs['callback'][run]])
+                if starts:
+                    awaiting.hear(target.topic if target is not None else '')
+                    job_of[run] = awaiting.newest(lambda _: True) if is_other else None
+                    if not is_other and self._row[run] >= 0:
+                        job = _Job(int(self._vertex[run]), int(self._row[run]))
+                        job_of[run] = job
+                        awaiting.receive(job)
+                elif at >= 0 and (answered := job_of.get(run)) is not None and (
+                        awaiting.is_answer(published.get(run, set()))
+                        and awaiting.answer(answered)):
+                    self._answers[run] = True
+                    self._vertex[run], self._row[run] = answered
+        return int(self._answers.sum()) > before
 
     def fill(self, table: Table, release: Ints, last: Mask) -> None:
         """
@@ -156,6 +217,8 @@ class ImportedJobs:
         done = np.flatnonzero(known & last)
         done = done[sort_by(runs['end_at'][done])]
         whole = self._whole(done)
+        driven = np.array(self._tables.driven)[self._vertex[done]] & DRIVEN != 0
+        whole &= ~driven | self._answers[done]
         cell = self._row[done[whole]] * len(self._after) + self._vertex[done[whole]]
         _, last_of = np.unique(cell[::-1], return_index=True)
         table['completes'][done] = LEG

@@ -203,14 +203,13 @@ class Fusion:
         self.topics['/obstacles'].publish(message)
 
     def note(self, what, message):
-        self.ran[what].append((int(message.frame_id), current_job().job))
+        job = current_job()
+        self.ran[what].append((int(message.frame_id), -1 if job is None else job.job))
 
 
-def test_a_sync_of_two_rates(make_executor, make_node, tmp_path):
-    """A result belongs to the scan whichever topic's callback makes it, and is judged once."""
-    path = tmp_path / 'run.mcap'
+def run_fusion(make_executor, make_node, graph, path):
     robot = Fusion(make_node)
-    executor = make_executor(loads(FUSED), num_workers=2, trace=str(path))
+    executor = make_executor(graph, num_workers=2, trace=str(path))
     for node in robot.nodes.values():
         executor.add_node(node)
     assert wait_for(lambda: all(each.get_subscription_count() for each in robot.topics.values()))
@@ -222,7 +221,13 @@ def test_a_sync_of_two_rates(make_executor, make_node, tmp_path):
             timer.cancel()
         assert wait_for(lambda: is_idle(executor))
     executor.shutdown()
-    statistics = executor.statistics()
+    return robot, executor.statistics()
+
+
+def test_a_sync_of_two_rates(make_executor, make_node, tmp_path):
+    """A result belongs to the scan whichever topic's callback makes it, and is judged once."""
+    path = tmp_path / 'run.mcap'
+    robot, statistics = run_fusion(make_executor, make_node, loads(FUSED), path)
     scans = statistics['dags']['lidar']['jobs']
     assert all(n == job for each in robot.ran.values() for n, job in each) or scans > max(
         n for n, _ in robot.ran['obstacles']) + 1     # a skipped release, on a busy machine
@@ -239,3 +244,15 @@ def test_a_sync_of_two_rates(make_executor, make_node, tmp_path):
     # a timer that was cancelled while it waited runs there
     completed, _, late, _ = verdicts(reschedule(path, workers=2).result())['/brake:stop']
     assert (completed >= live['/brake:stop'][0], late) == (True, 0)
+
+
+def test_a_sync_of_two_rates_in_a_run_without_declaration(make_executor, make_node, tmp_path):
+    """The same rule finds its results by the messages."""
+    path = tmp_path / 'run.mcap'
+    robot, _ = run_fusion(make_executor, make_node, None, path)
+    found = verdicts(replay(path, loads(FUSED)).result())
+    completed, _, late, _ = found['/brake:stop']
+    # each scan until the last one that was fused, also those that never were by themselves
+    last = max(number for number, _ in robot.ran['obstacles'])
+    assert (last + 1 - completed in (0, 1), late) == (True, 0)
+    assert sum(found['/brake:warn'][:2]) == completed and found['/brake:warn'][1] > 0
