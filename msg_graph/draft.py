@@ -65,6 +65,10 @@ class DraftCallback:
     :ivar sometimes: topics of ``publishes`` that it publishes only sometimes: in how many of how
         many executions, None if they are declared.
     :ivar judged: of a sink: False if it has no deadline.
+    :ivar driven_by: of a sync of different rates, the topic of ``starts`` that drives it.
+    :ivar why: of a proposed ``driven_by``, a comment with the reason.
+    :ivar least_interval_ns: if the times between its executions are irregular, the least of them.
+    :ivar stores: whether it seems to only store its message: it is short and publishes nothing.
     """
 
     node: str
@@ -85,6 +89,17 @@ class DraftCallback:
     also: dict[str, str] = field(default_factory=dict)
     sometimes: dict[str, tuple[int, int] | None] = field(default_factory=dict)
     judged: bool = True
+    driven_by: str | None = None
+    why: str = ''
+    least_interval_ns: int | None = None
+    stores: bool = False
+
+    @property
+    def triggers(self) -> list[str]:
+        """Return the topics that start it in a DAG."""
+        if self.kind not in ('subscription', 'sync'):
+            return []
+        return self.starts if self.driven_by is None else [self.driven_by]
 
     @property
     def key(self) -> str:
@@ -164,8 +179,9 @@ def leave_out_sources(
 
 
 def _is_source(callback: DraftCallback, published: Container[str]) -> bool:
-    return callback.kind != 'sync' and (
-        callback.kind != 'subscription' or callback.starts[0] not in published)
+    if callback.kind == 'sync' and callback.driven_by is None:
+        return False
+    return not callback.triggers or callback.triggers[0] not in published
 
 
 def accept(draft: Draft) -> None:
@@ -202,7 +218,7 @@ class _Writer:
             topic for each in self._callbacks for topic in each.maybe)
         self._started: dict[str, list[DraftCallback]] = {}
         for callback in self._callbacks:
-            for topic in callback.starts if callback.kind in ('subscription', 'sync') else ():
+            for topic in callback.triggers:
                 self._started.setdefault(topic, []).append(callback)
         self._fastest = self._fastest_sources()
 
@@ -263,13 +279,16 @@ class _Writer:
     def _entries(self, callback: DraftCallback) -> Iterator[str]:
         if callback.kind == 'timer':
             yield _timer(callback)
+        elif callback.driven_by is not None:
+            yield (f'sync: {{topics: {_listed(callback.starts)}, '
+                   f'driven_by: {callback.driven_by}}}{callback.why}')
         elif callback.kind == 'sync':
             yield f'sync: {_listed(callback.starts)}'
         else:
             yield f'{callback.kind}: {callback.starts[0]}'
         if callback.dag and self._is_source(callback):
             yield f'dag: {plain_scalar(callback.dag)}'
-        if callback.kind in ('subscription', 'service'):
+        if callback.kind in ('subscription', 'service') or callback.driven_by is not None:
             yield from self._period(callback)
         if callback.group is not None:
             yield f'group: {plain_scalar(callback.group)}'
@@ -310,6 +329,12 @@ class _Writer:
             yield f'period: {exact_duration(callback.period_ns)}'
             if callback.release_from != 'arrival':
                 yield f'release_from: {callback.release_from}'
+        elif callback.least_interval_ns is not None:
+            yield self._proposal(
+                f'period: {_rounded(callback.least_interval_ns)}', what,
+                'the least measured time between two of its executions, which are irregular')
+            yield self._proposal('sporadic: true', 'whether it has no fixed rate',
+                                 'its rate is irregular')
         elif callback.interval_ns is not None:
             yield self._proposal(
                 f'period: {_rounded(callback.interval_ns)}', what, _measured(callback))
@@ -328,6 +353,8 @@ class _Writer:
         if callback.deadline_ns is not None and not callback.maybe:
             return f'deadline: {exact_duration(callback.deadline_ns)}'
         what = 'if it is a sink' if callback.maybe else 'a sink'
+        if callback.stores and not callback.maybe:
+            return self._proposal('deadline: none', what, 'it seems to only store its message')
         source = self._fastest.get(callback.key)
         if source is None:
             return _blank('deadline: 100ms', f'{what}; no source with a known period leads here')

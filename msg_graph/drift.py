@@ -37,7 +37,15 @@ from typing import Any
 from msg_graph.binding import Entity, is_background, suggest_entity
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
-from msg_graph.model import Callback, Dag, legs_of, optional_edges, TaskSet, topological_order
+from msg_graph.model import (
+    Callback,
+    Dag,
+    legs_of,
+    optional_edges,
+    TaskSet,
+    topological_order,
+    Vertex,
+)
 
 TOLERANCE = 0.2
 LEAST = 10
@@ -189,14 +197,21 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
 
 def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift | None:
     releases = observed.releases.get(callback.key, Releases())
+    if releases.count == 1 and callback.kind == 'timer' and not callback.once and (
+            observed.duration_ns > LEAST * period):
+        return Drift('rate', callback.key, None, period, None, printable(
+            f'{callback.key} was released once in {observed.duration_ns / 1e9:.3f} s, and every '
+            f"{format_duration(period)} is declared: if it fires once, declare 'once: true'"))
     if releases.count < LEAST:
         return None
     mean = releases.mean_ns()
     if abs(mean - period) <= TOLERANCE * period or callback.sporadic and mean > period:
         return None
-    return Drift('rate', callback.key, None, period, mean,
-                 printable(f'{callback.key} was released every {format_duration(mean)}, and '
-                           f'{format_duration(period)} is declared'))
+    text = (f'{callback.key} was released every {format_duration(mean)}, and '
+            f'{format_duration(period)} is declared')
+    if mean > period and callback.kind != 'timer':
+        text += ": if it has no fixed rate, declare 'sporadic: true'"
+    return Drift('rate', callback.key, None, period, mean, printable(text))
 
 
 def _due_by_runs(callback: Callback, dags: list[Dag], observed: Observed) -> int | None:
@@ -222,9 +237,19 @@ def _message_rate(
             abs(got - expected) <= TOLERANCE * expected + len(dags)) or (
             got < expected and not is_certain):
         return None
-    return Drift('rate', callback.key, None, expected, got,
-                 printable(f'{callback.key} got {got} messages, and by the declaration '
-                           f'{expected} were due'))
+    text = f'{callback.key} got {got} messages, and by the declaration {expected} were due'
+    if got < expected:
+        topic = callback.topics[0]
+        keys = sorted({before.callback.key for before in _publishers(callback, dags)})
+        text += (f': if {" or ".join(keys)} published {topic} in {got} of {expected} runs, '
+                 f"declare 'may_publish: [{topic}]'")
+    return Drift('rate', callback.key, None, expected, got, printable(text))
+
+
+def _publishers(callback: Callback, dags: list[Dag]) -> list[Vertex]:
+    """Return the vertices that start the vertices of a callback."""
+    return [dag.vertices[before] for dag in dags for vertex in dag.vertices
+            if vertex.callback.key == callback.key for before in vertex.predecessors]
 
 
 def _certain(task_set: TaskSet) -> set[str]:

@@ -31,6 +31,7 @@ from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
 from mddag_executor.recording.entities import Callback, KINDS
 from mddag_executor.recording.head import is_declared, named_errors, read_head
+from mddag_executor.recording.mapping import declared_keys
 from mddag_executor.recording.tables import Ints, Mask, Recording, rows_by, sort_by, VERTEX
 from mddag_executor.replay.run import open_recording
 from mddag_executor.trace import TraceReader
@@ -45,6 +46,12 @@ import numpy as np
 PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
 LEAST_SILENT, LEAST_SILENT_SHARE = 2, 0.02
 """A callback publishes only sometimes if more executions, and a larger share, were silent."""
+DRIVEN_SHARE = 0.15
+"""The largest difference of two numbers of executions that count as equal."""
+STORES_NS = 500_000
+"""A callback that only stores its message takes no longer in nine of ten executions."""
+IRREGULAR = 3
+"""Times between executions are irregular if one in ten is so many times another one in ten."""
 ONCE_PERIODS = 3
 """A timer fires once if it was silent for so many periods after its only execution."""
 
@@ -102,6 +109,11 @@ class System:
         self._declared: dict[int, Declared] = {
             number: recording.task_set.vertices[vertex].callback for number, vertex in zip(
                 numbers.tolist(), recording.vertices_of_callbacks().tolist()) if vertex >= 0}
+        # those of the other topics of a driven sync run as no vertex
+        for number, key in declared_keys(self._who, recording.recorded_set).items():
+            if number not in self._declared and (
+                    callback := recording.recorded_set.callback(key)).driven_by is not None:
+                self._declared[number] = callback
         self._runs = {number: _runs_of(recording, chosen) for number, chosen in zip(
             numbers.tolist(), rows_by(index, len(numbers)))}
         self._find_publishers(recording)
@@ -147,6 +159,9 @@ class System:
             if unseen:
                 for callback in nodes[name].callbacks.values() if name in nodes else ():
                     callback.maybe.extend(t for t in unseen if t not in callback.publishes)
+        for node in nodes.values():
+            self._find_driven(node)
+            _find_stores(node)
         draft = Draft(
             f'the trace {self.name}', self._ordered(nodes), self._paths(nodes), self.workers)
         declared = {callback.key for callback in self._declared.values()}
@@ -155,6 +170,29 @@ class System:
             'it never ran')
         draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
         return draft
+
+    def _find_driven(self, node: DraftNode) -> None:
+        """
+        Join the subscriptions of a node that publish one topic at the rate of one of them.
+
+        They are a sync of different rates if several of them publish the topic, and together as
+        often as one of them runs.
+        """
+        declared = {callback.key for callback in self._declared.values()}
+        subscriptions = [each for each in node.callbacks.values()
+                         if each.kind == 'subscription' and each.key not in declared]
+        topics = dict.fromkeys(topic for each in subscriptions for topic in each.publishes)
+        for topic in topics:
+            several = [each for each in subscriptions if topic in each.publishes
+                       and each.kind == 'subscription' and each.name in node.callbacks]
+            runs = [each.runs or 0 for each in several]
+            if len({each.starts[0] for each in several}) < 2 or (
+                    max(runs) - min(runs) <= DRIVEN_SHARE * max(runs)):
+                continue
+            total = sum(_published_by(each, topic) for each in several)
+            driver = min(several, key=lambda each: abs((each.runs or 0) - total))
+            if abs((driver.runs or 0) - total) <= max(LEAST_SILENT, DRIVEN_SHARE * total):
+                _join(node, driver, [each for each in several if each is not driver], topic, total)
 
     def _processes(self, nodes: list[str]) -> dict[str, list[str]]:
         """Return the given nodes of each process; none if there is one process."""
@@ -256,6 +294,10 @@ class System:
                 [leg.times[leg.whole] for leg in legs or [runs]]))
         else:
             callback.interval_ns = int(np.ptp(runs.starts)) // (count - 1) if count > 1 else None
+            between = np.sort(np.diff(np.sort(runs.starts)))
+            if count > IRREGULAR and callback.kind != 'timer' and (
+                    between[len(between) * 9 // 10] > IRREGULAR * between[len(between) // 10]):
+                callback.least_interval_ns = max(1_000, int(between[0]))
             callback.times = execution_time(runs.times)
         return True
 
@@ -277,6 +319,46 @@ class System:
             if fits:
                 count += self._measure(callback, fits.pop(0))
         return count
+
+
+def _published_by(callback: DraftCallback, topic: str) -> int:
+    """Return in how many executions a callback published a topic that it has published."""
+    counts = callback.sometimes.get(topic)
+    return counts[0] if counts is not None else (callback.runs or 0)
+
+
+def _join(
+    node: DraftNode, driver: DraftCallback, others: list[DraftCallback], topic: str, total: int
+) -> None:
+    """Make one sync of subscriptions, which the topic of one of them drives."""
+    runs = driver.runs or 0
+    driver.why = (f'  # proposed: its executions published {topic} {total} times, and '
+                  f'{driver.starts[0]} came {runs} times')
+    published = {
+        each: sum(_published_by(c, each) for c in (driver, *others) if each in c.publishes)
+        for each in dict.fromkeys(t for c in (driver, *others) for t in c.publishes)}
+    driver.kind, driver.driven_by = 'sync', driver.starts[0]
+    driver.publishes = list(published)
+    driver.sometimes = {
+        each: (count, runs) for each, count in published.items()
+        if runs - count > max(LEAST_SILENT, DRIVEN_SHARE * runs)}
+    for other in others:
+        driver.starts += other.starts
+        if other.times is not None and (driver.times is None or (
+                other.times[0].mean_ns > driver.times[0].mean_ns)):
+            driver.times = other.times
+        del node.callbacks[other.name]
+
+
+def _find_stores(node: DraftNode) -> None:
+    """Mark the subscriptions that seem to only store a message for another callback."""
+    for callback in node.callbacks.values():
+        others = [each for each in node.callbacks.values() if each is not callback]
+        callback.stores = (
+            callback.kind == 'subscription' and not callback.publishes
+            and callback.times is not None
+            and callback.times[0].draw(0.9) <= STORES_NS
+            and any(each.publishes for each in others))
 
 
 def _runs_of(recording: Recording, which: Ints) -> Runs:
@@ -323,5 +405,5 @@ def _from_declared(declared: Declared) -> DraftCallback:
         declared.node, declared.name, declared.kind, starts, declared.period_ns,
         list(declared.may_publish), [],
         list(declared.reads), declared.group, declared.dag, declared.deadline_ns,
-        declared.release_from, also=also, judged=declared.judged,
+        declared.release_from, also=also, judged=declared.judged, driven_by=declared.driven_by,
         sometimes=dict.fromkeys(declared.may_publish))

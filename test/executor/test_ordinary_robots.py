@@ -10,7 +10,7 @@ from mddag_executor.executor import current_job
 from mddag_executor.replay import replay, reschedule
 from mddag_executor.replay.drafting import System
 from msg_graph import loads
-from msg_graph.draft import declaration_of
+from msg_graph.draft import accept, declaration_of
 import pytest
 from std_msgs.msg import Header
 
@@ -256,3 +256,26 @@ def test_a_sync_of_two_rates_in_a_run_without_declaration(make_executor, make_no
     last = max(number for number, _ in robot.ran['obstacles'])
     assert (last + 1 - completed in (0, 1), late) == (True, 0)
     assert sum(found['/brake:warn'][:2]) == completed and found['/brake:warn'][1] > 0
+
+
+def test_the_draft_of_a_run_without_declaration_knows_the_patterns(
+        make_executor, make_node, tmp_path, monkeypatch):
+    """Its verdict on the same recording has no false miss."""
+    def on_points(self, message):
+        self.on_boxes(None)     # on a busy machine no boxes came since the last scan
+        self.waiting = message
+        if int(message.frame_id) % 3 == 0:
+            self.on_boxes(None)
+
+    monkeypatch.setattr(Fusion, 'on_points', on_points)
+    path = tmp_path / 'run.mcap'
+    robot, _ = run_fusion(make_executor, make_node, None, path)
+    draft = System(path).draft()
+    accept(draft)
+    drafted = loads(declaration_of(draft, accepted=True).replace('deadline: ', 'deadline: 9s  # '))
+    fuse, = [each for each in drafted.callbacks if each.node == '/fusion']
+    assert (fuse.topics, fuse.driven_by) == (('/points', '/boxes'), '/points')
+    assert (fuse.publishes, fuse.may_publish) == (('/obstacles', '/alarm'), ('/alarm',))
+    found = verdicts(replay(path, drafted).result())
+    for name, (completed, _, late, expired) in found.items():
+        assert (completed > 0, late, expired) == (True, 0, 0), name
