@@ -84,5 +84,8 @@ executions that are checked for one that may start.
 REMEMBERED = 4096
 """How many past items of a kind are remembered: stamps of jobs, undeclared names."""
 
+HISTORY = 40
+"""How many of the last changes of threads an ``InvariantError`` tells."""
+
 LOG_EVERY_S = 10.0
 """The minimum time between two logged warnings of the same kind."""

@@ -26,9 +26,14 @@ CHECKED_PER_SECTION = 100
 
 
 class InvariantError(MddagError):
-    """The engine is in an invalid state; the text lists all violations."""
+    """
+    The engine is in an invalid state; the text lists all violations.
+
+    :ivar broken: these, and what the threads have done before.
+    """
 
     def __init__(self, broken: list[str]) -> None:
+        self.broken = broken
         super().__init__(
             f'engine: {"; ".join(broken)}: this is a defect of mddag_executor, please report it')
 

@@ -38,7 +38,7 @@ from mddag_executor.executor.bounds import (
 )
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import CHECK_NS, GilCheck, LAST_CHECK_NS
+from mddag_executor.executor.gil import CHECK_NS, CHECK_PART, GilCheck, LAST_CHECK_NS
 from mddag_executor.executor.loop import EventLoop, Parking
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
@@ -78,6 +78,10 @@ class Clocked(Protocol):
 
     def end_pauses(self) -> None:
         """Let paused callbacks go on."""
+
+    @property
+    def is_watched(self) -> bool:
+        """Return whether a paused thread checks the execution that holds the GIL."""
 
     def waited_since(self, since: int) -> int:
         """Return since when a thread has waited for events."""
@@ -226,11 +230,6 @@ class DueTimes:
 
     # --- the GIL ---------------------------------------------------------------------------------
 
-    @property
-    def is_checking(self) -> bool:
-        """Return whether a check is due at some time."""
-        return self._gil_check.at < NEVER
-
     def check_holder(self, now: int, is_late: bool = False) -> None:
         """
         Check whether the execution that holds the GIL computes, as another one waits for it.
@@ -242,12 +241,24 @@ class DueTimes:
             self._check_gil(now)  # the first reading, with which the next one is compared
         self.arm_by(self._next_check(now))
 
+    def check_late(self, now: int) -> None:
+        """
+        Check an execution that holds the GIL at once, if it has held it for longer than usual.
+
+        :param now: the time on the trace's clock.
+        """
+        holder = self._engine.interpreter_holder()
+        if (holder is not None and self._engine.usual_end(holder) < now
+                and not self._pool.is_watched and not self._gil_check.has_begun(holder)):
+            self.check_holder(now - self._offset, is_late=True)
+
     def _next_check(self, now: int) -> int:
         """Return when to check whether the first waiting execution may start; NEVER: no need."""
         if not self._engine.holders:
             return NEVER
         at = self._engine.overtaking_at() - self._offset
-        return min(at if at > now else NEVER, self._gil_check.at)
+        return min(at if at > now else NEVER,
+                   NEVER if self._pool.is_watched else self._gil_check.at)
 
     def arm_by(self, at: int) -> None:
         """Let a thread wake up at a time, unless it does sooner."""
@@ -262,9 +273,9 @@ class DueTimes:
         holder = self._engine.interpreter_holder()
         if holder is None:
             return
-        after, step = LAST_CHECK_NS, min(CHECK_NS, self._engine.patience() // 2)
+        after, step = LAST_CHECK_NS, min(CHECK_NS, self._engine.patience() // CHECK_PART)
         if is_late or holder.entity.wall_ns > SHORT_CALLBACK_NS:
-            after = max(step, 2 * holder.entity.habit.mean_ns)
+            after = max(step, self._engine.usual_end(holder) - self._offset - now)
         self._gil_check.begin(holder, now, after, step)
 
     def _check_gil(self, now: int) -> None:

@@ -517,6 +517,7 @@ class Engine:
         work = self._work.pop(x)
         work.entity.waiting.pop(x, None)  # one that goes on was removed before
         work.worker = worker
+        work.paused_ns = 0
         if work.entity.awaiting is not None and work.answers is None:
             self._begin_driven(work, work.entity.awaiting)
         if state.x_holds[x]:
@@ -591,18 +592,26 @@ class Engine:
         """Return whether the first waiting execution may overtake the latest holder of the GIL."""
         work = self.holders[-1]
         return overtaking_pays(
-            self.tables, self._state, 1, now - self._state.x_started[work.x],
+            self.tables, self._state, 1, now - self._held_from(work),
             work.entity.habit.mean_ns, self.pauses)
 
     def overtaking_at(self) -> int:
         """Return when the first waiting execution may overtake the latest holder of the GIL."""
         work = self.holders[-1]
-        return self._state.x_started[work.x] + overtaking_pays_from(
+        return self._held_from(work) + overtaking_pays_from(
             self.tables, self._state, 1, work.entity.habit.mean_ns, self.pauses)
 
     def interpreter_holder(self) -> Work | None:
         """Return the most urgent execution that holds the interpreter: the latest to overtake."""
         return self.holders[-1] if self.holders else None
+
+    def usual_end(self, work: Work) -> int:
+        """Return until when a running execution computes if it takes twice as long as usual."""
+        return self._held_from(work) + 2 * work.entity.habit.mean_ns
+
+    def _held_from(self, work: Work) -> int:
+        """Return when an execution would have started to hold the interpreter without pauses."""
+        return self._state.x_started[work.x] + work.paused_ns
 
     def _let_go(self, work: Work) -> None:
         if work in self.holders:

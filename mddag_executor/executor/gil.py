@@ -27,7 +27,7 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
 5.  *Waiting, not starving.*  A thread that has not computed since the last check may have waited
     for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU for
     ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
-    ``SWITCH_INTERVAL_S``.  It also did if, for a quarter of the time, it was not ready to run and
+    ``SWITCH_INTERVAL_S``.  It also did if, for an eighth of the time, it was not ready to run and
     no other thread computed.  Anything else is unclear, and counts only after ``LATELY`` checks,
     so that the GIL is not withheld from others for ever.
 """
@@ -72,7 +72,12 @@ SELDOM = 32
 
 CHECK_NS = 2_000_000
 LAST_CHECK_NS = 10 * CHECK_NS
-"""The interval between checks grows from the first to the last; short callbacks use the last."""
+CHECK_PART = 4
+"""
+The interval between checks grows from the first to the last; short callbacks use the last.
+
+The first is shorter if what waits is urgent: this part of ``Engine.patience``.
+"""
 
 SWITCH_INTERVAL_S = 0.001
 """
@@ -304,6 +309,10 @@ class GilCheck:
                 # on a grid, so that several short callbacks do not each set the timer again
                 self.at = self.at // CHECK_NS * CHECK_NS + CHECK_NS
 
+    def has_begun(self, subject: object) -> bool:
+        """Return whether there is a first reading of an execution."""
+        return self.subject is subject and self._last is not None
+
     def end(self) -> None:
         """Stop checking."""
         self.subject = None
@@ -331,7 +340,7 @@ class GilCheck:
                 return True
             others = max(0, new.process - last.process - own)
             delayed = new.schedule.delay_ns - last.schedule.delay_ns
-            if 4 * (passed - others - delayed) >= passed:
+            if 8 * (passed - others - delayed) >= passed:
                 return True
         self._unclear += 1
         return self._unclear >= LATELY

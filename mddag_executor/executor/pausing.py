@@ -18,8 +18,9 @@ tools use all of its identifiers, the two share the GIL.
     library, which may own locks that others need at once.
 3.  A callback may pause while it owns a lock that the urgent one needs.  So the paused thread
     checks every ``CHECK_S`` whether the urgent one computes.  If that got no CPU since the last
-    check, and is asleep, the paused one goes on.  (A thread that waits for the GIL wakes up
-    every switch interval; one that waits for a CPU is not asleep.)
+    check, and is asleep, the paused one goes on, and the urgent one gives the GIL up.  (A thread
+    that waits for the GIL wakes up every switch interval; one that waits for a CPU is not
+    asleep.)
 """
 
 from __future__ import annotations
@@ -52,9 +53,12 @@ class Pause:
 
     :param thread: the ``WorkerThread`` that pauses.
     :param urgent: that of the callback that overtakes it, or of another one after that.
+    :ivar is_watching: whether the thread checks that while it pauses, or as soon as it does.
+    :ivar since: when it was asked to pause (monotonic ns).
     """
 
-    __slots__ = ('_thread', 'ident', 'urgent', '_may_go_on', '_has_begun', '_codes', '_is_taken')
+    __slots__ = ('_thread', 'ident', 'urgent', '_may_go_on', '_has_begun', '_codes', '_is_taken',
+                 'is_watching', 'since')
 
     def __init__(self, thread: Any, urgent: Any) -> None:
         self._thread = thread
@@ -65,7 +69,9 @@ class Pause:
         self._has_begun = threading.Lock()
         self._has_begun.acquire()
         self._is_taken = False
+        self.since = monotonic_ns()
         self._codes = [*_own_code(sys._current_frames().get(self.ident))]
+        self.is_watching = bool(self._codes)
         if self._codes:
             _monitor.begin(self, self._codes)
 
@@ -85,12 +91,16 @@ class Pause:
             measurement.pause()
         begun = monotonic_ns()
         self._has_begun.release()
-        self._wait()
+        urgent_computes = self._wait()
+        self.is_watching = False
         self._thread.paused_ns += monotonic_ns() - begun
         if measurement is not None:
             measurement.resume()
+        if not urgent_computes:
+            self._thread.pool.overtaker_waits(self.urgent)
 
-    def _wait(self) -> None:
+    def _wait(self) -> bool:
+        """Wait for ``end``; return False if the urgent callback waits before."""
         own, slept = cpu_ns(self.urgent.ident), -2
         while not self._may_go_on.acquire(timeout=CHECK_S):
             before, own = own, cpu_ns(self.urgent.ident)
@@ -99,8 +109,9 @@ class Pause:
                 continue
             schedule = schedule_of(self.urgent.vtid)
             if schedule.is_asleep and schedule.slices in (slept, -1):
-                return  # it may wait for a lock of this one
+                return False  # it may wait for a lock of this one
             slept = schedule.slices
+        return True
 
     def end(self) -> None:
         """Let the thread go on."""

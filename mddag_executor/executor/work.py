@@ -99,12 +99,13 @@ class Work:
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: its CPU time.
     :ivar coroutine: its ``coroutines.Steps``, if it is one and has begun.
+    :ivar paused_ns: for how long it has paused since it was dispatched.
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
     __slots__ = (
         'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
-        'ready_ns', 'cpu_ns', 'yields', 'answers', 'published')
+        'ready_ns', 'cpu_ns', 'yields', 'paused_ns', 'answers', 'published')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -119,7 +120,7 @@ class Work:
         self.answers: Origin | None = None
         self.published: frozenset[str] = frozenset()
         self.x = self.worker = -1
-        self.ready_ns = self.cpu_ns = self.yields = 0
+        self.ready_ns = self.cpu_ns = self.yields = self.paused_ns = 0
 
     def step(self, must_check: bool = True) -> Any:
         """

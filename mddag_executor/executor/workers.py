@@ -56,6 +56,7 @@ from mddag_executor.errors import from_user_code
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     END_S,
+    HISTORY,
     MOST,
     MOST_YIELD_NS,
     REJOIN_NS,
@@ -220,7 +221,9 @@ class WorkerPool:
         self.clock = clock
         self._offset = clock.offset_ns
         # reentrant only to know its owner: a signal handler may run inside
-        self.lock = engine_lock(engine.validate, engine.size)
+        self.lock = engine_lock(self._validate, engine.size)
+        # the last changes of threads: time, name, and new state
+        self._history = deque([(0, '', '')] * HISTORY, HISTORY)
         #: functions to call when the calling thread does not own the lock
         self.deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
@@ -553,14 +556,28 @@ class WorkerPool:
             else:
                 found = receive(me, wait())
 
+    def _validate(self) -> None:
+        """Check the engine; the error says what the threads have done before."""
+        try:
+            self.engine.validate()
+        except InvariantError as error:
+            raise InvariantError([*error.broken, *self._story()]) from None
+
+    def _story(self) -> list[str]:
+        return [f'{(at - self.now) / 1e6:+.3f} ms {name} {state}'
+                for at, name, state in self._history if name]
+
     def _become(self, me: WorkerThread, state: ThreadState) -> None:
         """Change the state of a thread; the caller holds the lock."""
         before = me.state
         if before is state:
             return
         if state not in _NEXT[before]:
-            raise InvariantError([f'a thread that was {before.value} is {state.value}'])
+            raise InvariantError(
+                [f'a thread that was {before.value} is {state.value}', *self._story()])
         me.state = state
+        name = 'visitor' if me.thread is None else me.thread.name
+        self._history.append((self.now, name, state.value))
         if me.thread is not None:
             self._n_parked += (state is ThreadState.PARKED) - (before is ThreadState.PARKED)
         if state is ThreadState.WAITING:
@@ -622,6 +639,8 @@ class WorkerPool:
         if self.running and not self.polling:
             self._polled_at = now
             self._collect(self.loop.poll(), now)
+            if self.engine.has_waiting:
+                self.due.check_late(self.now)
 
     def _go_on(self, me: WorkerThread, is_last: bool = False) -> bool:
         """
@@ -737,11 +756,28 @@ class WorkerPool:
         else:  # the last one has just ended
             pause.urgent = me
 
+    @property
+    def is_watched(self) -> bool:
+        """Return whether a paused thread checks the execution that holds the GIL."""
+        return any(pause.is_watching for pause in self._pauses.values())
+
+    def overtaker_waits(self, urgent: WorkerThread) -> None:
+        """Take the GIL from the execution of a thread that does not compute."""
+        with self.lock:
+            self.tick()
+            holder = self.engine.interpreter_holder()
+            if holder is not None and urgent.work is holder:
+                self.engine.stop_holding(holder)
+                self.end_pauses()
+                self.wake_for_more()
+
     def end_pauses(self) -> None:
         """Let those go on that are overtaken no more; the caller holds the lock."""
         overtaken = self.engine.holders[:-1]
         for work in [each for each in self._pauses if each not in overtaken]:
-            self._pauses.pop(work).end()
+            pause = self._pauses.pop(work)
+            work.paused_ns += self.now - self._offset - pause.since
+            pause.end()
 
     def _rest(self, me: WorkerThread) -> None:
         """Let a thread without an execution wait for events, or park it."""

@@ -12,7 +12,7 @@ from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.entity import Entity, TIMER
 from mddag_executor.executor.gil import GilCheck, GilHabit
 from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Work
@@ -427,6 +427,34 @@ def test_what_is_urgent_waits_less_for_a_callback_that_was_expected_to_end(deadl
     assert check.at == 2 * MS + engine.patience() // 2
 
 
+def test_the_time_of_pauses_does_not_count_as_held():
+    """Else an overtaken callback would soon seem to take longer than usual."""
+    engine = new_engine(workers=2)
+    entity = new_entity(holds=True)
+    entity.habit.mean_ns = 5 * MS
+    engine.ready(Work(entity, print), 0)
+    work = engine.dispatch(0, MS)
+    assert engine.usual_end(work) == 11 * MS
+    pays_at = engine.overtaking_at()
+    work.paused_ns = 3 * MS
+    assert engine.usual_end(work) == 14 * MS and engine.overtaking_at() == pays_at + 3 * MS
+
+
+@pytest.mark.parametrize('kind, deadline, part', [
+    ('declared', '40ms', 2.5), ('declared', '8ms', 2), ('undeclared', '40ms', 25),
+    ('waits', '40ms', 0)])
+def test_how_long_a_timer_may_stay_unnoticed(make_executor, kind, deadline, part):
+    """For a part of deadline or period; one whose callback waits not at all."""
+    task_set = loads(graph(n=f'name: tick, timer: 10ms, deadline: {deadline}'))
+    executor = make_executor(task_set)
+    entity = entity_of(executor._engine, task_set, 0, 0)
+    entity.kind = TIMER
+    if kind == 'undeclared':
+        entity.callback, entity.source = None, -1
+    entity.habit = GilHabit(kind != 'waits')
+    assert executor._pool.due.allowance(entity, 10 * MS) == part * MS
+
+
 class Steps:
     """An engine with entities of several kinds, each work of which has a number."""
 
@@ -622,3 +650,4 @@ def test_a_broken_invariant_ends_the_spin(make_executor, make_node):
         count(executor._engine, N_HOLDING)
         spinning.join()
         executor._engine._state.scalars[N_HOLDING] -= 1
+    assert 'mddag-worker-' in str(spinning.error)  # what threads did before
