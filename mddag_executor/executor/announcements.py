@@ -27,7 +27,10 @@ sequence number, and job.  Both processes have the same system clock.
 5.  *Announcements come from outside.*  One that cannot be true (an unknown vertex or topic, a
     release in the future or long ago) is ignored.  They are handled before all callbacks, so they
     get a twentieth of a core at most; those beyond that are ignored as well, with a warning.
-6.  Executors understand each other only if they have the same declaration: its digest is in the
+6.  *Not published.*  If an execution ends without a topic of ``may_publish`` that starts a
+    callback elsewhere, that is announced as well, with the sequence number ``SILENT``.  The job is
+    opened in a process where it is not open yet, so that its results count as not due there.
+7.  Executors understand each other only if they have the same declaration: its digest is in the
     name of the topic.  Each process has its own topic, so that it does not receive its own
     announcements.
 """
@@ -75,6 +78,8 @@ MOST_ENTRIES = 256
 SHARE, SAVED_NS = 20, 20_000_000
 """Announcements get this part of a core (1 of ``SHARE``), and may save this time of it."""
 # sender, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
+SILENT = 2 ** 64 - 1
+"""In place of a sequence number: the topic was not published in the job."""
 _ENTRY = struct.Struct('<QQQqqQQqiiI')
 
 
@@ -117,6 +122,7 @@ class Announcements:
                 callback_group=ReentrantCallbackGroup())
             for i in range(len(names)) if i != own]
         self._jobs.announce = self._announce
+        self._engine.on_silent = self._announce_silent
 
     def unmatched(self) -> list[str]:
         """Return the topics on which the processes have not discovered each other."""
@@ -131,6 +137,7 @@ class Announcements:
     def close(self) -> None:
         """Stop announcing."""
         self._jobs.announce = None
+        self._engine.on_silent = None
         self._publisher = None
         self.node.destroy_node()
 
@@ -152,6 +159,15 @@ class Announcements:
         return _ENTRY.pack(
             self._token, id(publication.numbers), publication.sequence, publication.begin,
             publication.end, home, number, release, dag, origin.vertex, self._number[topic])
+
+    def _announce_silent(self, origin: Origin, topic: str) -> None:
+        """Announce that a vertex ends without a topic (rule 6); the engine's lock is held."""
+        job, publisher = self._job(origin), self._publisher
+        if job is not None and publisher is not None and topic not in self._contested:
+            (home, number), release = job
+            self._pool.deferred.append(partial(publisher.publish, UInt8MultiArray(data=_ENTRY.pack(
+                self._token, 0, SILENT, 0, 0, home, number, release, origin.dag, origin.vertex,
+                self._number[topic]))))
 
     def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
         """Return name and release of a job; None: no job, or it has ended meanwhile."""
@@ -175,7 +191,14 @@ class Announcements:
             return
         begin = time.thread_time_ns()
         for entry in _ENTRY.iter_unpack(message.data):
-            if self._is_plausible(*entry[-4:]):
+            if not self._is_plausible(*entry[-4:]):
+                continue
+            if entry[2] == SILENT:
+                home, number, release, dag, vertex, topic = entry[5:]
+                self._engine.hear_silent(
+                    Announced((home, number), dag, vertex, release + self._clock.offset_ns),
+                    self._topics[topic], self._pool.now)
+            else:
                 self._note(*entry)
         for entry in list(self._waiting):
             origin = self._find(entry[1], entry[2])

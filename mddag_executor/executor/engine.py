@@ -47,6 +47,7 @@ from mddag_executor.core.overload import admit, is_late
 from mddag_executor.core.queues import first_of, overtaking_pays, overtaking_pays_from
 from mddag_executor.core.state import (
     ALONE,
+    ELSEWHERE,
     EXPIRED,
     IDLE,
     JUDGE_FROM,
@@ -118,6 +119,8 @@ class Engine:
             if each.callback.driven_by is not None:
                 self._driven.setdefault(each.callback.key, []).append(number)
                 self.awaiting.setdefault(each.callback.key, Awaiting(each.callback))
+        #: Announces that a vertex ends without a topic that starts one in another process.
+        self.on_silent: Callable[[Origin, str], None] | None = None
         admit(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.jobs, process)
@@ -751,8 +754,23 @@ class Engine:
         if not failed and pending >= 0:
             for after, topic in self._optional_edges[vertex]:
                 if topic not in published:
+                    if self.on_silent is not None and self._state.expected[after] == ELSEWHERE:
+                        self.on_silent(origin, topic)
                     self.scheduler.withhold(slot, vertex, after, now)
         return published
+
+    def hear_silent(self, job: Announced, topic: str, now: int) -> None:
+        """Leave out of a job what an execution in another process has not started."""
+        several = self._optional_edges.get(job.vertex, ()) if job.dag >= 0 else ()
+        if self._finished or self._state.expected[job.vertex] != ELSEWHERE or topic not in [
+                each for _, each in several]:
+            return
+        origin = self._entering(job.dag, job.name, job.vertex, min(job.release, now), now)
+        if origin is not None:
+            for after, each in several:
+                if each == topic and self._is_open(origin):
+                    self.scheduler.withhold(origin.slot, job.vertex, after, now)
+            self._decided(now)
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""

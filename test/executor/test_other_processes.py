@@ -182,6 +182,36 @@ def test_every_job_is_found_by_its_number(make_executor, make_node):
     assert sum(sink['completed'] for sink in last['sinks'].values()) == 2 * len(releases)
 
 
+SOMETIMES = graph(
+    camera='name: tick, timer: 20ms, publishes: [/image], dag: main',
+    detector='name: detect, subscription: /image, publishes: [/boxes], may_publish: [/alarm]',
+    brake="""
+        name: stop, subscription: /alarm, deadline: 60s
+        name: map, subscription: /boxes, deadline: 60s""")
+
+
+def test_a_result_that_another_process_did_not_ask_for_is_not_due(make_executor, make_node):
+    """The detector is elsewhere: its jobs end where the brake is, and do not wait to expire."""
+    nodes = Declared(make_node, SOMETIMES, {'detect': lambda: frozenset(
+        [] if len(nodes.ran['detect']) % 3 == 0 else ['/alarm'])}, reentrant=False)
+    text = loads(SOMETIMES + 'processes: {p1: [/camera, /detector], p2: [/brake]}')
+    executors = [make_executor(text, process=process, nodes=[nodes.nodes[n] for n in here.split()])
+                 for process, here in (('p1', 'camera detector'), ('p2', 'brake'))]
+    with Spinning(executors[0]), Spinning(executors[1]):
+        assert wait_for(lambda: nodes.connected() and not any(e.unmatched() for e in executors))
+        nodes.start(*executors)
+        assert wait_for(lambda: len(nodes.ran['stop']) >= 5)
+        nodes.cancel()
+        n = len(nodes.ran['detect'])
+        assert wait_for(lambda: sum(
+            executors[1].statistics()['dags']['main']['ends'].values()) == n)
+    sinks = executors[1].statistics()['dags']['main']['sinks']
+    assert (sinks['/brake:stop']['completed'], sinks['/brake:stop']['not_due']) == (
+        len(nodes.ran['stop']), n - len(nodes.ran['stop']))
+    assert sinks['/brake:map']['completed'] == n
+    assert executors[1].statistics()['dags']['main']['ends']['completed'] == n
+
+
 def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_executor, make_node):
     """Those of a stranger; and those on a topic on which two processes publish are a doubt."""
     text = GRAPH.replace('publishes: [/join_right]', 'publishes: [/join_left]').replace(
