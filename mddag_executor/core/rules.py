@@ -118,6 +118,7 @@ from heapq import heappop, heappush
 from mddag_executor.core.jobs import (
     close_job,
     deactivate,
+    free_slot,
     give_up,
     judge,
     outdate_sink,
@@ -219,9 +220,9 @@ def _keep_timely(t: Tables, s: State, x: int, now: int) -> None:
 def _outdate(t: Tables, s: State, x: int, now: int) -> None:
     """Drop a waiting execution for that of a newer job, and its job or sink with it (rule 13)."""
     slot, vertex = s.x_slot[x], s.x_vertex[x]
-    if is_late(t, s, x, now):
-        announce_late(t, s, x, now)
     if s.job_state[slot] == OPEN:
+        if is_late(t, s, x, now):
+            announce_late(t, s, x, now)
         if t.n_predecessors[vertex] == 0:
             give_up(t, s, slot, OUTDATED, now)
         else:
@@ -532,7 +533,9 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         s.x_pending[head] = -1
         if s.job_state[slot] == OPEN:
             _complete_vertex(t, s, key, slot, vertex, now)
-    deactivate(s, slot)
+    s.job_active[slot] -= 1  # not deactivate(): a call less, too
+    if s.job_active[slot] == 0 and s.job_state[slot] != OPEN:
+        free_slot(s, slot)
     return whole
 
 

@@ -80,7 +80,10 @@ def entry_points() -> dict[str, Callable[..., Any]]:
     for module in _MODULES:
         inner = ModuleType(module.__name__)  # for names such as `rules.complete`
         for name, function in _functions(module):
-            space[name] = njit(error_model='numpy')(_bound(function, space))
+            # only compiled functions call it: no wrappers for Python or C
+            space[name] = njit(
+                error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True)(
+                    _bound(function, space))
             setattr(inner, name, space[name])
         if module in (jobs, overload, rules):
             space[module.__name__.rsplit('.', 1)[1]] = inner

@@ -53,6 +53,7 @@ class Run:
     leg: int
     group: int
     holds: bool
+    queue: tuple[int, int] | None = None  # of a callback, in which runs start in their order
     began: bool = False
     owns: bool = False
     lent: bool = False
@@ -80,16 +81,18 @@ class LiveDriver(RuleBasedStateMachine):
     """Messages arrive late or never, threads take, complete, lend and suspend in any order."""
 
     @initialize(task_set=task_sets(max_dags=2, max_callbacks=4, groups=False, optional=True),
-                workers=st.integers(1, 3), policy=st.sampled_from(sorted(POLICIES)))
-    def start(self, task_set, workers, policy):
+                workers=st.integers(1, 3), policy=st.sampled_from(sorted(POLICIES)),
+                on_late=st.sampled_from(['continue', 'demote']))
+    def start(self, task_set, workers, policy, on_late):
         self.task_set = task_set
         self.tables = Tables.build(
             task_set, legs=True, max_active_jobs=MAX_ACTIVE,
-            expire_after=EXPIRE_AFTER, default_deadline=10 * TICK)
+            expire_after=EXPIRE_AFTER, default_deadline=10 * TICK, on_late=on_late)
         self.scheduler = Scheduler(self.tables, workers, policy)
         self.state = self.scheduler.state
         self.deadlines = Deadlines(self.scheduler.tables, self.state)
         self.workers = workers
+        self.queues = [-1, self.scheduler.new_queue(), self.scheduler.new_queue()]
         self.groups = [-1, self.scheduler.new_group(), self.scheduler.new_group()]
         self.now = 0
         self.runs = []
@@ -151,15 +154,17 @@ class LiveDriver(RuleBasedStateMachine):
                 job.slot, vertex, leg)] == IDLE:
             self.make_ready(job, vertex, leg, group, holds)
         else:
-            self.undeclared(group, holds)
+            self.undeclared(group, holds, 0)
 
-    @rule(group=ANY_GROUP, holds=HOLDS)
-    def undeclared(self, group, holds):
+    @rule(group=ANY_GROUP, holds=HOLDS, queue=st.integers(0, 2))
+    def undeclared(self, group, holds, queue):
         self.counter['undeclared'] += 1
         job = self.tables.n_dags, self.counter['undeclared']
         group = self.groups[group]
-        x = self.scheduler.ready_undeclared(job[1], group, int(holds), -1, self.now)
-        self.note(Run(x, job, self.tables.n_vertices, 0, group, holds))
+        queue = self.queues[queue]
+        x = self.scheduler.ready_undeclared(job[1], group, int(holds), queue, self.now)
+        self.note(Run(x, job, self.tables.n_vertices, 0, group, holds,
+                      (-1, queue) if queue >= 0 else None))
 
     def make_ready(self, job, vertex, leg, group, holds):
         x = self.scheduler.execution(job.slot, vertex, leg)
@@ -167,7 +172,7 @@ class LiveDriver(RuleBasedStateMachine):
         self.state.x_group[x], self.state.x_holds[x] = group, int(holds)
         self.scheduler.ready(x, self.now)
         job.started.add((vertex, leg))
-        self.note(Run(x, (job.dag, job.index), vertex, leg, group, holds))
+        self.note(Run(x, (job.dag, job.index), vertex, leg, group, holds, (vertex, leg)))
         self.settle()  # it may have replaced a late one
 
     def note(self, run):
@@ -409,10 +414,10 @@ class LiveDriver(RuleBasedStateMachine):
 
     def queue(self, run):
         """Return the others that wait in the queue of a run."""
-        if run.began or run.vertex == self.tables.n_vertices or run.fate != WAITING:
+        if run.began or run.queue is None or run.fate != WAITING:
             return []
         return [other for other in self.alive() if other is not run and other.fate == WAITING
-                and not other.began and (other.vertex, other.leg) == (run.vertex, run.leg)]
+                and not other.began and other.queue == run.queue]
 
     def is_head(self, run):
         """Return whether a run is the first in its queue, or one that it has just left."""
