@@ -63,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
     tests = result['tests']
     warn(*_warnings(task_set, result))
     common.show(args, result, (
-        table(_HEADER, _rows(result), grouped=5), *_requirements(result), *_tests(result),
+        table(_HEADER, _rows(result), grouped=5), *_bounds(result), *_tests(result),
         _summary(task_set, result)))
     return int(args.fail_on_unschedulable and not all(test['holds'] for test in tests))
 
@@ -171,14 +171,10 @@ def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
             yield [*of_dag, short[sink], 'none' if deadline is None else format_ns(deadline)]
 
 
-def _requirements(result: dict[str, Any]) -> Iterator[str]:
-    rows: list[list[Cell]] = [
-        [name, what, format_ns(each['required_ns']),
-         'not bounded' if each['bound_ns'] is None else format_ns(each['bound_ns'])]
-        for name, required in result.get('requirements', {}).items()
-        for what, each in required.items()]
-    if rows:
-        yield table(('path', '', 'required', 'if all sinks are in time'), rows, grouped=1)
+def _bounds(result: dict[str, Any]) -> Iterator[str]:
+    from mddag_executor.report.tables import bounds_table
+    if 'requirements' in result:
+        yield bounds_table(result['requirements'])
 
 
 def _tests(result: dict[str, Any]) -> Iterator[str]:

@@ -32,7 +32,7 @@ TASKS = {
         'simulate': 'run a declaration in virtual time',
         'evaluate': 'measure acceptance ratios over many simulated runs',
         'generate': 'make random multi-deadline, multi-rate DAG sets',
-        'graph assign-deadlines': 'give the sinks deadlines, by critical path or by search'},
+        'graph assign-deadlines': 'give the sinks deadlines, by critical paths and requirements'},
 }
 VERBS = {verb: summary for verbs in TASKS.values() for verb, summary in verbs.items()}
 # What to do instead of a verb that earlier versions had.

@@ -1,46 +1,39 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Deadlines for sinks: in proportion to critical paths, or the tightest that reach a target.
+Deadlines for sinks: in proportion to critical paths, and short enough for what paths require.
 
 Theory of operation
 -------------------
 A sink's critical path is the longest path from the source to it, by a budget (mean, 99 % quantile
-or maximum) of the execution times.  Deadlines are rounded up to whole us.  The *search*:
+or maximum) of the execution times.  Deadlines are rounded to whole us.
 
-1. Every sink's deadline is its critical path times one scale.  A scale is *good* when the lower
-   end of the 95 % confidence interval of the acceptance is at or above the target.
-2. All scales are tried with the same draws of execution times.  The scale is doubled or halved
-   until one is good and another is not, then the gap is halved (on a logarithmic scale) down to
-   ``PRECISION``.  Acceptance grows with the scale, but for anomalies; nothing is concluded about
-   scales that were not tried.
-3. The draws that chose the scale favour it.  So the reported acceptance comes from as many other
-   draws, of the next seed.
-4. Open jobs at the end are judged too, and no deadline is longer than half of a run: else an
-   overload would look good because nothing was judged.
+1. The sink of a DAG with the longest critical path gets the period, the others less, in
+   proportion.
+2. A requirement of a path bounds the sum of T + D over its segments (``msg_graph.segments``).  The
+   time that the periods leave is shared among the deadlines in proportion to the critical paths,
+   but no sink gets more than by rule 1; the others share the rest.
+3. A segment that ends before a sink is bounded by one of the sinks after it: the one with the
+   shortest critical path.
+4. Of several paths through a sink the shortest deadline counts.  So no requirement is broken for
+   another one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-import math
 from typing import Any, NamedTuple
 
 from mddag_executor.errors import UsageError
-from mddag_executor.laboratory.acceptance import wilson, Z_95
-from mddag_executor.laboratory.evaluate import evaluate, plain_s
+from mddag_executor.laboratory.acceptance import wilson
+from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment
-from mddag_executor.laboratory.tasks import tasks_of
-from mddag_executor.simulate.schedule import compiling_pays
-from msg_graph import TaskSet
-from msg_graph.duration import whole_us
+from mddag_executor.laboratory.tasks import Task, tasks_of
+from msg_graph import format_duration, Path, TaskSet
+from msg_graph.duration import MICROSECOND, whole_us
 from msg_graph.edit import with_deadlines
-
-PRECISION = 0.01
-"""The result is larger than a scale that is not good by this part, at most."""
-_LEAST_SCALE = 2.0 ** -20
-_USUAL_SCALES = 11
+from msg_graph.segments import ends_of, Segment, segments, sinks_after
 
 Deadlines = dict[str, int]
 """Relative deadlines of sinks, ns, by their callbacks' keys."""
@@ -68,32 +61,37 @@ class Measured(NamedTuple):
         return {**self._asdict(), 'ratio': self.ratio, 'interval_95': list(self.interval)}
 
 
-class Found(NamedTuple):
+class _Part(NamedTuple):
+    """A segment of a path: its sinks, and their longest critical path, ns."""
+
+    segment: Segment
+    period: int
+    sinks: frozenset[str]
+    length: int
+
+
+def assigned(task_set: TaskSet, budget: str) -> Deadlines:
     """
-    Outcome of a search.
+    Return deadlines for all sinks, with which each path meets what is required of it.
 
-    :ivar scale: the tightest good one.
-    :ivar tried: every scale that was tried, with its acceptance.
-    :ivar check: the acceptance with draws that took no part in the search.
+    :raises mddag_executor.errors.UsageError: an execution time is not declared, or a requirement
+        cannot be met.
     """
+    tasks = tasks_of(task_set, budget)
+    deadlines = proportional(tasks)
+    most = dict(deadlines)
+    for path in task_set.paths:
+        for what, required in path.requirements.items():
+            shares = _shares(_parts(task_set, tasks, path, what), most, path, what, required)
+            for key, share in shares.items():
+                deadlines[key] = min(share, deadlines[key])
+    return deadlines
 
-    scale: float
-    deadlines: Deadlines
-    tried: list[tuple[float, Measured]]
-    check: Measured
 
-
-def proportional(task_set: TaskSet, budget: str) -> Deadlines:
-    """
-    Return deadlines in proportion to the critical paths.
-
-    The sink of a DAG with the longest critical path gets the period, the others less.  A callback
-    that is several sinks gets the shortest one.
-
-    :raises mddag_executor.errors.UsageError: an execution time is not declared.
-    """
+def proportional(tasks: list[Task]) -> Deadlines:
+    """Return deadlines by rule 1; a callback that is several sinks gets the shortest one."""
     deadlines: Deadlines = {}
-    for task in tasks_of(task_set, budget):
+    for task in tasks:
         for index, _, length in task.sinks:
             key = task.dag.vertices[index].callback.key
             deadline = whole_us(task.period * (length / task.length if task.length else 1.0))
@@ -101,18 +99,73 @@ def proportional(task_set: TaskSet, budget: str) -> Deadlines:
     return deadlines
 
 
-def scaled(task_set: TaskSet, budget: str, scale: float) -> Deadlines:
-    """
-    Return critical paths times a scale; a callback that is several sinks gets the longest.
+def _parts(task_set: TaskSet, tasks: list[Task], path: Path, what: str) -> list[_Part]:
+    """Return the segments of a path with the sinks that bound them (rule 3)."""
+    found = []
+    every = segments(task_set, path)
+    for number, segment in enumerate(every):
+        periods, sinks, longest = [0], set(), 0
+        for dag, last in ends_of(task_set, list(segment.callbacks)):
+            lengths = {index: length for index, _, length in tasks[dag.index].sinks}
+            after = sinks_after(dag, last.index)
+            if not after:
+                raise UsageError(
+                    f'path {path.name}: {what}: no sink with a deadline comes after '
+                    f'{segment.callbacks[-1]}, so nothing bounds it: give one a deadline')
+            if not (dag.sporadic or dag.once):
+                periods.append(dag.period_ns)
+            elif number and not (what == 'age' and number == len(every) - 1):
+                raise UsageError(
+                    f'path {path.name}: {what}: {segment.callbacks[0]} waits for a source that is '
+                    'sporadic or fires once, so nothing bounds it: start it by a timer')
+            sink = min(after, key=lambda index: lengths[index])
+            sinks.add(dag.vertices[sink].callback.key)
+            longest = max(longest, lengths[sink])
+        waits = what == 'reaction' or number < len(every) - 1
+        found.append(_Part(segment, max(periods) if waits else 0, frozenset(sinks), longest))
+    return found
 
-    :raises mddag_executor.errors.UsageError: an execution time is not declared.
-    """
-    deadlines: Deadlines = {}
-    for task in tasks_of(task_set, budget):
-        for index, _, length in task.sinks:
-            key = task.dag.vertices[index].callback.key
-            deadlines[key] = max(whole_us(length * scale), deadlines.get(key, 0))
-    return deadlines
+
+def _shares(
+    parts: list[_Part], most: Deadlines, path: Path, what: str, required: int
+) -> Deadlines:
+    """Return the deadlines of the sinks of a path (rule 2)."""
+    left = required - sum(part.period for part in parts)
+    needed = sum(part.length for part in parts)
+    if needed > left or left <= 0:
+        slowest, longest = (max(parts, key=lambda part: getattr(part, name))
+                            for name in ('period', 'length'))
+        is_period = left <= 0 or slowest.period > longest.length
+        part = slowest if is_period else longest
+        raise UsageError(
+            f'path {path.name}: {"an" if what == "age" else "a"} {what} of '
+            f'{format_duration(required)} cannot be met: its periods take '
+            f'{format_duration(required - left)} and its critical paths '
+            f'{format_duration(needed)}: shorten first the ' + (
+                f'period of {part.segment.dag}, {format_duration(part.period)}' if is_period else
+                f'critical path to {min(part.sinks)}, {format_duration(part.length)}'))
+    found: Deadlines = {}
+    open_parts = list(parts)
+    while open_parts:
+        total = sum(part.length for part in open_parts)
+        shares = [left * part.length // total if total else left // len(open_parts)
+                  for part in open_parts]
+        bounded = [part for part, share in zip(open_parts, shares)
+                   if share >= max(part.length, *(most[key] for key in part.sinks))]
+        for part, share in zip(open_parts, shares):
+            limit = max(part.length, *(most[key] for key in part.sinks))
+            if part in bounded:
+                left -= limit
+            for key in part.sinks:
+                deadline = max(MICROSECOND, min(share, limit) // MICROSECOND * MICROSECOND)
+                found[key] = min(deadline, found.get(key, deadline))
+        if not bounded:
+            break
+        open_parts = [part for part in open_parts if part not in bounded]
+        for part in open_parts:     # they share what the others leave
+            for key in part.sinks:
+                found.pop(key, None)
+    return found
 
 
 def measure(
@@ -121,6 +174,9 @@ def measure(
 ) -> Measured:
     """
     Return the acceptance of some deadlines.
+
+    Open jobs at the end are also judged: else an overload would look good because nothing was
+    judged.
 
     :param experiment: with one policy; its task set's deadlines are ignored.
     :raises KeyboardInterrupt: it was interrupted.
@@ -132,62 +188,3 @@ def measure(
     if outcome.interrupted:
         raise KeyboardInterrupt
     return Measured(int(outcome.accepted[0].sum()), runs, experiment.seed)
-
-
-def least_runs(target: float) -> int:
-    """Return how many runs, all accepted, show an acceptance of that target."""
-    runs = math.ceil(Z_95 ** 2 * target / (1.0 - target))
-    while wilson(runs, runs)[0] < target:
-        runs += 1
-    return max(1, runs)
-
-
-def search(
-    experiment: Experiment, target: float, budget: str = 'p99', runs: int = 1000, jobs: int = 1,
-    progress: Callable[[float, int], None] = lambda scale, done: None,
-) -> Found:
-    """
-    Search the tightest scale that reaches a target.
-
-    :param experiment: with one policy; its task set's deadlines are ignored.
-    :param runs: with each scale.
-    :param progress: gets the scale, and how many of its runs are done.
-    :raises UsageError: no deadlines reach the target, or so many runs cannot show it.
-    """
-    if not 0.0 < target < 1.0:
-        raise UsageError(
-            f'--target {target:g}: it is out of range: give a ratio above 0 and below 1')
-    if runs < least_runs(target):
-        raise UsageError(f'--target {target:g}: {runs} runs cannot show it: give --runs '
-                          f'{least_runs(target)} or more')
-    compiled = compiling_pays(plain_s((experiment,), runs * _USUAL_SCALES) / jobs)
-    tried: list[tuple[float, Measured]] = []
-
-    def acceptance(scale: float, seed: int) -> Measured:
-        deadlines = scaled(experiment.task_set, budget, scale)
-        if max(deadlines.values()) > experiment.duration_ns // 2:
-            best = max((measured.ratio for _, measured in tried), default=0.0)
-            raise UsageError(
-                f'--target {target:g}: no scale with deadlines up to half of a run reaches it '
-                f'(the best accepted {100 * best:.1f} %): give a lower target, more --workers, '
-                'or a longer --duration')
-        return measure(replace(experiment, seed=seed), deadlines, runs, jobs,
-                       lambda done: progress(scale, done), compiled)
-
-    def is_good(scale: float) -> bool:
-        if scale < _LEAST_SCALE:
-            raise UsageError(
-                '--target: any deadline can be met, because all execution times are about zero')
-        tried.append((scale, acceptance(scale, experiment.seed)))
-        return tried[-1][1].interval[0] >= target
-
-    good = 1.0
-    factor = 0.5 if is_good(good) else 2.0
-    while is_good(good * factor) == (factor < 1.0):
-        good *= factor
-    bad, good = sorted((good, good * factor))
-    while good > bad * (1.0 + PRECISION):
-        middle = math.sqrt(bad * good)
-        bad, good = (bad, middle) if is_good(middle) else (middle, good)
-    return Found(good, scaled(experiment.task_set, budget, good), tried,
-                 acceptance(good, (experiment.seed + 1) % 2 ** 64))

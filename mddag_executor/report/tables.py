@@ -73,6 +73,14 @@ def sink_table(dags: Mapping[str, Any]) -> str:
                  marked=[not is_kept(sink.result) for sink in found], grouped=1)
 
 
+def bounds_table(required: Mapping[str, Any]) -> str:
+    """Return a table of requirements, and how long each takes at most if sinks are in time."""
+    return table(('path', '', 'required', 'if all sinks are in time'), ([
+        name, what, format_ns(each['required_ns']),
+        'not bounded' if each['bound_ns'] is None else format_ns(each['bound_ns'])]
+        for name, every in required.items() for what, each in every.items()), grouped=1)
+
+
 def requirement_table(requirements: Requirements) -> str:
     """Return a table with a row for each requirement of a path; most misses first."""
     header, cells = requirement_columns(requirements)

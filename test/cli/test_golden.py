@@ -35,9 +35,6 @@ COMMANDS = {
         'graph check graph.yaml --fail-on-unschedulable -q; '
         'graph check timed.yaml --fail-on-unschedulable --budget max --workers 3'),
     'assign': 'graph assign-deadlines graph.yaml --runs 20 -o out.yaml',
-    'assign_target': (
-        'graph assign-deadlines graph.yaml --target 0.8 --runs 40 --duration 100ms '
-        '--json out.json'),
     'place': 'graph place graph.yaml --processes 2 -o out.yaml',
     'place_json': 'graph place graph.yaml --processes 2 --json - -o out.yaml',
     'place_trace': 'graph place graph.yaml own.mcap --processes 2 -o -',

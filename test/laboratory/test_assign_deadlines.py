@@ -1,22 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Deadlines by critical path and by search."""
+"""Deadlines by critical path and by what paths require."""
 
 from dataclasses import replace
+from pathlib import Path
+import random
 
 from mddag_executor.errors import UsageError
-from mddag_executor.laboratory.acceptance import wilson
-from mddag_executor.laboratory.assign_deadlines import (
-    measure,
-    PRECISION,
-    proportional,
-    scaled,
-    search,
-)
-from mddag_executor.laboratory.evaluate import Experiment
-from msg_graph import loads
+from mddag_executor.laboratory.assign_deadlines import assigned
+from mddag_executor.laboratory.tasks import tasks_of
+from mddag_executor.replay.requirements import of_computed
+from msg_graph import load, loads
+from msg_graph.edit import with_deadlines
+from msg_graph.segments import bound, segments
 import pytest
 
+from ..replay.path_systems import random_system, simulated_run
+
+TOP = Path(__file__).resolve().parents[2]
 GRAPH = """\
 mddag: 1
 workers: 1
@@ -29,7 +30,7 @@ nodes:
         subscription: /b
         deadline: 50ms
         execution_time: {quantiles_us: [1000, 3000, 9000], percent: [0, 50, 100]}
-      - {name: z, timer: 10ms, deadline: 10ms, dag: two, execution_time: 1ms}
+      - {name: z, timer: 10ms, reads: [x], deadline: 10ms, dag: two, execution_time: 1ms}
 """
 #: /n:s is a sink of both DAGs.
 SHARED = """\
@@ -41,57 +42,95 @@ nodes:
       - {name: b, timer: 40ms, publishes: [/a], dag: two, execution_time: 1ms}
       - {name: s, subscription: /a, deadline: 5ms, execution_time: 1ms}
 """
+PATH = "paths: [{{name: p, callbacks: ['/n:t', '/n:x', '/n:z'], {}}}]\n"
 
 
-def experiment(**changes):
-    return replace(Experiment(
-        loads(GRAPH), ('rad',), workers=1, duration_ns=200_000_000), **changes)
-
-
-def test_proportional_and_scaled():
+def test_proportional():
     # To x it is 2 ms, to y 1 ms + 9 ms.
-    assert proportional(loads(GRAPH), 'max') == {
+    assert assigned(loads(GRAPH), 'max') == {
         '/n:x': 4_000_000, '/n:y': 20_000_000, '/n:z': 10_000_000}
-    assert proportional(loads(GRAPH), 'mean')['/n:x'] == 8_000_000
+    assert assigned(loads(GRAPH), 'mean')['/n:x'] == 8_000_000
     with pytest.raises(UsageError, match="budget 'median': there is no such budget"):
-        proportional(loads(GRAPH), 'median')
-    assert proportional(loads(SHARED), 'max') == {'/n:s': 20_000_000}
-    assert scaled(loads(GRAPH), 'max', 1.5) == {
-        '/n:x': 3_000_000, '/n:y': 15_000_000, '/n:z': 1_500_000}
-    assert scaled(loads(GRAPH), 'max', 1e-9)['/n:x'] == 1_000
-    assert scaled(loads(SHARED), 'max', 2.0) == {'/n:s': 8_000_000}
+        assigned(loads(GRAPH), 'median')
+    assert assigned(loads(SHARED), 'max') == {'/n:s': 20_000_000}
 
 
-def test_search_finds_the_tightest_scale():
-    """The scale is good, one that is 1 % smaller is not; what is reported had no part in it."""
-    found = search(experiment(seed=3), 0.9, 'mean', runs=200)
-    assert found.deadlines == scaled(loads(GRAPH), 'mean', found.scale)
-    tried = dict(found.tried)
-    assert tried[found.scale].ratio < 1.0  # acceptance grows bit by bit
-    assert wilson(tried[found.scale].accepted, 200)[0] >= 0.9
-    below = max(scale for scale in tried if scale < found.scale)
-    assert found.scale <= below * (1 + PRECISION)
-    assert tried[below].interval[0] < 0.9
-    assert {each.seed for each in tried.values()} == {3}
-    again = measure(experiment(seed=4), found.deadlines, 200)
-    assert (found.check, found.check.seed) == (again, 4)
-    low, high = found.check.interval
-    assert low <= found.check.ratio <= high
+@pytest.mark.parametrize(('required', 'x', 'z'), [
+    ('reaction: 1s', 4, 10),            # nothing has to be shorter
+    ('reaction: 42ms', 4, 8),           # of the 12 ms that are left x would get 8, so z gets more
+    ('reaction: 36ms', 4, 2),           # x and z share 6 ms
+    ('reaction: 33ms', 2, 1),           # just the critical paths
+    ('age: 26ms', 4, 2),                # no period of the last segment
+    ('reaction: 42ms, age: 26ms', 4, 2)])
+def test_requirements_by_hand(required, x, z):
+    """The critical paths are 2 and 1 ms, the periods 20 and 10 ms."""
+    task_set = loads(GRAPH + PATH.format(required))
+    found = assigned(task_set, 'max')
+    assert found == {'/n:x': x * 10 ** 6, '/n:y': 20_000_000, '/n:z': z * 10 ** 6}
 
 
-@pytest.mark.parametrize(('others', 'scale'), [
-    ('', 1.0),  # just its critical path is enough, and nothing less
-    ('- {name: u, timer: 20ms, dag: u, deadline: 9ms, execution_time: 1ms}', 1.5)])
-def test_scale_by_hand(others, scale):
-    """One callback takes always 2 ms, alone or next to one that is more urgent."""
-    task_set = loads(f"""\
-mddag: 1
-nodes:
-  - node: /n
-    callbacks:
-      - {{name: s, timer: 20ms, dag: s, deadline: 9ms, execution_time: 2ms}}
-      {others}
-""")
-    found = search(experiment(task_set=task_set), 0.5, runs=10)
-    assert scale <= found.scale <= scale * (1 + PRECISION)
-    assert found.deadlines['/n:s'] == pytest.approx(scale * 2_000_000, rel=PRECISION)
+@pytest.mark.parametrize(('change', 'required', 'says'), [
+    ((), 'reaction: 30ms', 'path p: a reaction of 30ms cannot be met: its periods take 30ms and '
+     'its critical paths 3ms: shorten first the period of one, 20ms'),
+    ((), 'age: 22ms', 'path p: an age of 22ms cannot be met'),
+    (('dag: two, execution_time: 1ms', 'dag: two, execution_time: 25ms'), 'reaction: 50ms',
+     'its critical paths 27ms: shorten first the critical path to /n:z, 25ms'),
+    (('reads: [x], deadline: 10ms', 'reads: [x], deadline: none'), 'reaction: 50ms',
+     'path p: reaction: no sink with a deadline comes after /n:z, so nothing bounds it: give')])
+def test_what_cannot_be_met_says_what_is_too_long(change, required, says):
+    text = GRAPH.replace(*change) if change else GRAPH
+    with pytest.raises(UsageError) as caught:
+        assigned(loads(text + PATH.format(required)), 'max')
+    assert says in str(caught.value)
+
+
+def holds(task_set):
+    """Assign deadlines and simulate; return whether all sinks were in time."""
+    deadlines = assigned(task_set, 'max')
+    task_set = with_deadlines(task_set, deadlines)
+    shortest = {}
+    for task in tasks_of(task_set, 'max'):
+        for index, _, length in task.sinks if task.length <= task.period else ():
+            key = task.dag.vertices[index].callback.key
+            shortest[key] = min(length, shortest.get(key, length))
+    assert all(deadlines[key] >= length - 1000 for key, length in shortest.items())
+    for path in task_set.paths:
+        for what, required in path.requirements.items():
+            assert bound(task_set, path, what) <= required
+    result, run = simulated_run(task_set)
+    if not result['deadline_missed']:
+        for name, every in of_computed(run)['requirements'].items():
+            for what, each in every.items():
+                assert each['completed'] > 0 and not each['late'], (task_set.file, name, what)
+    return not result['deadline_missed']
+
+
+def with_requirements(task_set, factor):
+    """Return a task set whose paths allow their periods and some times their critical paths."""
+    lengths = {task.dag.name: task.length for task in tasks_of(task_set, 'max')}
+    paths = []
+    for path in task_set.paths:
+        parts = segments(task_set, path)
+        least = sum(lengths[part.dag] for part in parts)
+        periods = sum(part.period_ns for part in parts)
+        paths.append(replace(path, reaction_ns=round(periods + factor * least),
+                             age_ns=round(periods - parts[-1].period_ns + factor * least)))
+    return replace(task_set, paths=tuple(paths))
+
+
+@pytest.mark.parametrize('seeds', [
+    range(40), pytest.param(range(40, 1040), marks=pytest.mark.nightly)])
+def test_requirements_hold_in_random_systems(seeds):
+    in_time = 0
+    for seed in seeds:
+        chance = random.Random(seed)
+        task_set = loads(random_system(chance), f'{seed}.yaml')
+        if task_set.paths:
+            in_time += holds(with_requirements(task_set, chance.uniform(1.0, 4.0)))
+    assert in_time > len(seeds) // 3
+
+
+def test_requirements_hold_on_the_paths_of_autoware():
+    task_set = load(TOP / 'config' / 'autoware.yaml')
+    assert task_set.paths
+    holds(replace(with_requirements(task_set, 1.5), workers=7))
