@@ -65,10 +65,10 @@ def test_mypy():
     run('mypy')
 
 
-# Being rebuilt: their prose is checked when that is done.
+# The core and the pool are being rebuilt: their prose is checked when that is done.
 UNCHECKED_ENGLISH = (
-    'mddag_executor/cli/run.py', 'mddag_executor/core/', 'mddag_executor/executor/',
-    'mddag_executor/hosting/', 'test/')
+    'mddag_executor/core/', 'mddag_executor/executor/due.py', 'mddag_executor/executor/workers.py',
+    'test/')
 
 
 def test_english():

@@ -264,7 +264,7 @@ def _end(error: BaseException | None, status: int = 0) -> int:
             if not t.daemon and t is not threading.main_thread()]
     if not left:
         return status
-    warn(f'threads that nodes started still run and are left behind: {listed(left)}')
+    warn(f'threads that nodes started still run and are abandoned: {listed(left)}')
     _exit(status)
 
 
@@ -319,7 +319,7 @@ def _run(
     watch = Watch(executor, task_set)
     seconds = None if args.duration is None else args.duration / 1e9
     signals.end_of(session)
-    if host is not None:  # without progress: programs use the terminal, too
+    if host is not None:  # without progress: programs also use the terminal
         outcome: tuple[dict[str, Any], BaseException | None] = host.run(
             partial(_run_programs, args, task_set, session, watch, host, programs, seconds), leave)
         return outcome
@@ -347,7 +347,7 @@ def _result(
         'measured': None if ledger is None or plan is None else measure(ledger, plan)}
     result['drift'] = [each.result() for each in watch.drift(counts)]
     if not session.clean:
-        warn('a callback has not ended in time; it is left behind')
+        warn('a callback has not ended in time; it is abandoned')
     if args.part is not None:
         result.update(observed=asdict(watch.observed(counts)))
     return result
@@ -388,7 +388,7 @@ def _run_synthetic(
             # The jobs of one process of several begin or end in others.
             return workload.ledger if measured and args.process is None else None
     finally:
-        # Processes that destroy hundreds of entities while their peers do, too, may wait for each
+        # Processes that destroy hundreds of entities while their peers do so may wait for each
         # other within the middleware; a process of several ends without that.
         if args.part is None:
             workload.destroy()
@@ -436,7 +436,7 @@ def _run_programs(
             raise
     left = host.end(session.is_patient)
     for guest in left:
-        warn(f'--node {guest.program.spec}: its main() has not ended in time; it is left behind')
+        warn(f'--node {guest.program.spec}: its main() has not ended in time; it is abandoned')
     if left:
         host.interrupt()
     errors = [guest.error for guest in host.guests

@@ -12,7 +12,7 @@ sequence number, and job.  Both processes have the same system clock.
 
 1.  *Announced* is each publication on a topic by which a DAG leaves the process, for the DAGs that
     ``processes:`` divides and whose jobs no header stamp identifies (``other_processes``).  A
-    publication of no job is announced, too, so that no message waits for it.
+    publication of no job is announced as well, so that no message waits for it.
 2.  A job has one name everywhere: the executor that released it first, and its number there.  It
     has one release, by the steady clock that all processes of a machine share.  Publications of a
     topic that overlap in time are announced together, when the last of them has returned, because

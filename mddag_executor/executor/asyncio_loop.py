@@ -130,7 +130,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
         self.set_task_factory(_task)
 
     def __hash__(self) -> int:
-        """Return the hash; whoever asks for it may ask for the current task (rule 2)."""
+        """Return the hash; its user may be asking for the current task (rule 2)."""
         if self._owner != get_ident():
             self.join()
         return object.__hash__(self)
@@ -139,7 +139,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
         return self is other
 
     def _check_thread(self) -> None:
-        """Allow calls from steps in debug mode, too: they own the turnstile."""
+        """Allow calls from steps even in debug mode: they own the turnstile."""
 
     def call_soon(  # type: ignore[override]
         self, callback: Callable[..., object], *args: Any,
@@ -254,7 +254,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
                 return
             thread.join(2 * CLOSE_S)
             if thread.is_alive():
-                self._warn('a callback of asyncio has not ended: it is left behind')
+                self._warn('a callback of asyncio has not ended: it is abandoned')
                 return
         self.close()
 

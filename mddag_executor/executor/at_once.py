@@ -41,7 +41,7 @@ class AtOnce:
         self.has_run = False
 
     def ring(self) -> None:
-        """End the current wait, or the next one; from any thread, also in a signal handler."""
+        """End the current wait, or the next one; from any thread or signal handler."""
         self.loop.wake()
 
     def handle(self, events: Events) -> bool:

@@ -104,7 +104,7 @@ def _taker(take: Callable[[Any], tuple[Any, Any]], kind: Any) -> Callable[
 
 
 callback_type: Callable[[Any], Any] = attrgetter('_callback_type')
-"""Whether a subscription's callback takes a message's info, too: then ``WITH_INFO``."""
+"""Whether a subscription's callback also takes a message's info: then ``WITH_INFO``."""
 
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
 

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 1.  ``shutdown`` ends the executor and waits for running callbacks.  So does a spin that ends with
     its context.
-2.  An executor that nobody shuts down ends when its context ends while it does not spin, or when
+2.  An executor that is not shut down ends when its context ends while it does not spin, or when
     it is destroyed.  Neither can wait for a lock or a thread: a thread that owns any lock may be
     the one that collects garbage.  So the parked workers are only told to end, and the last of
     them does the rest.

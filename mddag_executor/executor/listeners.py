@@ -83,7 +83,7 @@ def set_listener(kind: str, address: int, fd: int) -> None:
     """
     Let the middleware write to an eventfd at each arrival at an entity.
 
-    Earlier arrivals count, too: the descriptor becomes readable at once, with ``MANY``.
+    Earlier arrivals count as well: the descriptor becomes readable at once, with ``MANY``.
 
     :param kind: ``subscription``, ``service``, ``client``, ``event`` or ``timer``.
     :param address: of the rcl entity, which must not be destroyed meanwhile.

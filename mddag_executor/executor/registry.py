@@ -138,7 +138,7 @@ class Registry:
         return added, gone
 
     def _name(self, node: Any) -> str:
-        """Return a node's name, also if it has been destroyed but not removed."""
+        """Return a node's name, even if it has been destroyed but not removed."""
         name: str | None = self._names.get(node)
         if name is None:
             name = self._names[node] = node.get_fully_qualified_name()

@@ -113,7 +113,7 @@ def _nanoseconds(name: str, time: Any) -> Any:
 
 
 def diagnostics_period_ns(period: int | str | Duration | None) -> int | None:
-    """Return the period of the diagnostics in ns; None, also for 0: no diagnostics."""
+    """Return the period of the diagnostics in ns; None, and None for 0: no diagnostics."""
     period = _nanoseconds('diagnostics_period', period)
     if period is None or period == 0:
         return None
@@ -142,7 +142,7 @@ def resolve(
                                       if type(graph) is int else ''))
     if num_threads is not None:
         if num_workers is not None:
-            raise UsageError('num_threads: num_workers is given, too: give one of the two')
+            raise UsageError('num_threads: num_workers is also given: give one of the two')
         num_workers = whole_number('num_threads', num_threads, MOST_WORKERS)
     if num_workers is None:
         num_workers = workers(None, task_set)

@@ -93,7 +93,7 @@ class WaitableSource(ChannelSource):
 
     def listen(self) -> None:
         """Let the middleware announce arrivals, or raise ListenerError or InvalidHandle."""
-        with self._lock:  # announcements meanwhile must not fill the wait set, too
+        with self._lock:  # announcements meanwhile must not also fill the wait set
             self._set.parts(self._set.waitables,
                             lambda kind, address: set_listener(kind, address, self.fd))
         if self._has_more:

@@ -83,7 +83,7 @@ def _answer(
 ) -> NoReturn:
     """Send the class of an error, or None, and its text or the result."""
     signal_at_end_of(parent, signal.SIGKILL)
-    for stream in (1, 2):  # native code of rclpy writes there, too
+    for stream in (1, 2):  # native code of rclpy also writes there
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     # This machine only: the child and nodes of other machines must not discover each other.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

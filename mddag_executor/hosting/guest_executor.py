@@ -132,7 +132,7 @@ class GuestExecutor:
             try:
                 self.host.wait(self._changed, lambda: False, None, self.guest)
                 return
-            except KeyboardInterrupt:  # it interrupts the callbacks, too
+            except KeyboardInterrupt:  # it also interrupts the callbacks
                 self.host.note_interrupt()
 
     def _adopt(self, nodes: list[Node]) -> None:

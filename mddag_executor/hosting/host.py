@@ -23,8 +23,8 @@ Theory of operation
    ``EventsExecutor``                 makes a ``GuestExecutor``
    =================================  ============================================================
 
-   Afterwards the working directory is the earlier one, too, if that still exists: paths of results
-   may be relative.
+   Afterwards the working directory is the earlier one again, if that still exists: paths of
+   results may be relative.
 
 3. A program that spins passes its nodes to the host's executor and waits until the run or the
    program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are then
@@ -94,7 +94,7 @@ class Guest:
     :ivar returned: whether its main has returned nodes.
     :ivar uses_ros: whether it has initialised rclpy.
     :ivar error: the exception that has ended its main.
-    :ivar done: is set when all that follows its main is done, too.
+    :ivar done: is set when all that follows its main is also done.
     :ivar signals: those that rclpy handles for it, with the Python handler of each at that time,
         which rclpy's calls.
     :ivar interrupted: whether a SIGINT has come that its next spin raises.
@@ -178,7 +178,7 @@ class Host:
     # --- programs --------------------------------------------------------------------------------
 
     def load(self, specs: Iterable[str], ros_arguments: Iterable[str] = ()) -> list[Program]:
-        """Find programs; their modules are imported under the host's replacements, too."""
+        """Find programs; their modules are imported under the host's replacements as well."""
         self._loading = True
         try:
             return [resolve(spec, ros_arguments) for spec in specs]

@@ -203,7 +203,7 @@ def _script(spec: str, path: Path) -> Program:
 
 def describe(error: BaseException) -> str:
     """Return an exception on one line, with the place where it was raised."""
-    # str(error) may raise, too
+    # even str(error) may raise
     text = ' '.join(str(traceback.TracebackException.from_exception(error)).split())
     name = type(error).__name__
     if isinstance(error, SyntaxError) and error.filename is not None:

@@ -143,7 +143,7 @@ class Supervisor:
         return self._stop
 
     def stop(self) -> None:
-        """End the run; from any thread, also from a signal handler."""
+        """End the run; from any thread or signal handler."""
         self._stop = True
 
     def hurry(self) -> None:

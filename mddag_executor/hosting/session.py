@@ -75,20 +75,20 @@ class Session:
         try:
             self._spin()
         except ExternalShutdownException:
-            pass  # the context was shut down: that ends a run, too
+            pass  # the context was shut down: that also ends a run
         except BaseException as error:
             self.error = error
         finally:
             self.stop()
 
     def stop(self) -> None:
-        """End the run, also from a signal handler."""
+        """End the run, even from a signal handler."""
         self.stopped = True
         with suppress(RuntimeError):  # it is released already
             self._bell.release()
 
     def hurry(self) -> None:
-        """Wait no longer for what still runs at the end; also from a signal handler."""
+        """Wait no longer for callbacks that still run at the end, even from a signal handler."""
         self._is_hurried = True
 
     def is_patient(self) -> bool:

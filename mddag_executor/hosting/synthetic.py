@@ -449,8 +449,8 @@ class SyntheticWorkload:
         sensors = []
         for start, vertices in sources.items():
             self._n_publishers[start] += 1
-            # One message on a topic releases all DAGs with a source on it, in other processes,
-            # too.
+            # One message on a topic releases all DAGs with a source on it, even in other
+            # processes.
             callback = vertices[0].callback
             if self._is_here(callback.node):
                 if not self._sensor_nodes:

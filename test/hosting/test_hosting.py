@@ -228,9 +228,9 @@ def test_what_does_not_end_is_left_behind(world):
     done = Done(process.returncode, Path('out.txt').read_text(), Path('err.txt').read_text())
     assert heard(done.result) >= 3 and done.result['nodes'] == [*specs]
     for line in (
-        'not JSON', 'warning: a callback has not ended in time; it is left behind',
-        'warning: --node chat:never_ends: its main() has not ended in time; it is left behind',
-        'warning: threads that nodes started still run and are left behind: stubborn',
+        'not JSON', 'warning: a callback has not ended in time; it is abandoned',
+        'warning: --node chat:never_ends: its main() has not ended in time; it is abandoned',
+        'warning: threads that nodes started still run and are abandoned: stubborn',
     ):
         assert line in done.stderr.splitlines()
 
