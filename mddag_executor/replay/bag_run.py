@@ -22,7 +22,7 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS
 from mddag_executor.recording.columns import concatenate, rows
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import Recording, RELEASES, sort_by
+from mddag_executor.recording.tables import Ints, Recording, RELEASES, sort_by
 from mddag_executor.replay.bags import Bag, BagError
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
@@ -35,8 +35,9 @@ _STAMPS = {
     'source_timestamp': ('published', 'publication time')}
 """By ``release_from``: the column of ``Stamps``, and its name in messages."""
 
-Jobs = list[tuple[int, int]]
-"""Jobs of a source as pairs (ready, release), ns."""
+Jobs = tuple[Ints, Ints]
+"""When the jobs of a source are ready, and their releases, ns."""
+_NONE: Jobs = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 
 
 def _source(bag: Bag, dag: Dag) -> tuple[Jobs, str]:
@@ -46,7 +47,7 @@ def _source(bag: Bag, dag: Dag) -> tuple[Jobs, str]:
         jobs = _timer_jobs(bag, dag.period_ns)
         pauses = len(bag.stretches) - 1
         return jobs, (
-            f'{counted(len(jobs), "job")} at the nominal period of its timer, from the '
+            f'{counted(len(jobs[0]), "job")} at the nominal period of its timer, from the '
             'first message on: a bag does not show when timers ran'
             + (f'; none in {counted(pauses, "pause")} of over a minute without any message'
                if pauses else ''))
@@ -54,37 +55,39 @@ def _source(bag: Bag, dag: Dag) -> tuple[Jobs, str]:
         bag.warnings.append(
             f'{bag.name}: {dag.name} starts with a service call, which a bag does not have: there '
             'are no jobs of it')
-        return [], 'no jobs: its source is a service'
+        return _NONE, 'no jobs: its source is a service'
     topic = callback.topics[0]
     stamps = bag.stamps.get(topic)
     if stamps is None:
         bag.warnings.append(
             f'{bag.name}: topic {topic} is not in it, so there are no jobs of {dag.name}')
-        return [], f'no jobs: {topic} is not in the bag'
+        return _NONE, f'no jobs: {topic} is not in the bag'
     name, what = _STAMPS[dag.release_from]
-    column = getattr(stamps, name)
-    usable = [stamp <= arrival and bool(credible(stamp, arrival))
-              for arrival, stamp in zip(stamps.arrival, column)]
-    jobs = sorted((arrival, stamp if fits else arrival)
-                  for arrival, stamp, fits in zip(stamps.arrival, column, usable))
-    if name != 'arrival' and not all(usable):
+    arrival, stamp = np.array(stamps.arrival), np.array(getattr(stamps, name))
+    usable = (stamp <= arrival) & credible(stamp, arrival)
+    release = np.where(usable, stamp, arrival)
+    order = np.lexsort((release, arrival))
+    jobs = arrival[order], release[order]
+    if name != 'arrival' and not usable.all():
         bag.warnings.append(
-            f'{bag.name}: {usable.count(False)} of {counted(len(jobs), "message")} of '
+            f'{bag.name}: {np.count_nonzero(~usable)} of {counted(len(order), "message")} of '
             f'{topic} ({stamps.type}) without a {what}, or with one after the arrival or '
             'years before: released at the arrival')
-    return jobs, f'{counted(len(jobs), "job")} from the {what} of {topic}'
+    return jobs, f'{counted(len(order), "job")} from the {what} of {topic}'
 
 
 def _timer_jobs(bag: Bag, period: int) -> Jobs:
     """Return the jobs of a timer: at its period, while messages arrive."""
-    found: Jobs = []
+    found, count = [np.zeros(0, dtype=np.int64)], 0
     begin = bag.start or 0
     for start, end in bag.stretches:
         first = begin - (begin - start) // period * period
-        if (end - first) // period + len(found) >= _MOST_JOBS:
+        if (end - first) // period + count >= _MOST_JOBS:
             raise _too_many(bag)
-        found.extend((t, t) for t in range(first, end + 1, period))
-    return found
+        found.append(np.arange(first, end + 1, period))
+        count += len(found[-1])
+    times = np.concatenate(found)
+    return times, times
 
 
 def _too_many(bag: Bag) -> BagError:
@@ -103,10 +106,9 @@ def read_bag(
         raise BagError(bag.name, what.removeprefix(f'{bag.name}: '), 'record one again')
     parts, notes = [rows(RELEASES)], []
     for dag in task_set.dags:
-        jobs, note = _source(bag, dag)
+        (ready, release), note = _source(bag, dag)
         notes.append(f'{dag.name}: {note}')
-        ready, release = np.array(jobs, dtype=np.int64).reshape(-1, 2).T
-        parts.append(rows(RELEASES, len(jobs), dag=dag.index, job=np.arange(len(jobs)),
+        parts.append(rows(RELEASES, len(ready), dag=dag.index, job=np.arange(len(ready)),
                           release=release, noticed=ready))
         if sum(map(len, parts)) > _MOST_JOBS:
             raise _too_many(bag)

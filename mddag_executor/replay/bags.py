@@ -21,15 +21,13 @@ Theory of operation
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 import io
-from itertools import compress
 import os
 from pathlib import Path
 import re
 import sqlite3
-import struct
 import tempfile
 from typing import Any, BinaryIO
 
@@ -39,6 +37,7 @@ from mddag_executor.trace import TraceReader
 from mddag_executor.trace.blocks import other_kind
 from mddag_executor.trace.channels import Topic
 from mddag_executor.trace.errors import renamed, unreadable
+from mddag_executor.trace.events import Ints
 from mddag_executor.trace.times import FAR_NS, NEVER, stretches
 from msg_graph import GraphError
 from msg_graph.yamltext import parse_yaml, plain
@@ -54,7 +53,9 @@ _MESSAGE_LIMIT = 1 << 30    # bytes of a message, decompressed
 _BAG_FILE = re.compile(r'.*\.(mcap|db3)(\.zstd)?')
 _PIECE = 1 << 20
 _UNPACKED_LIMIT, _MOST_TIMES = 64 * 1024 * 1024, 1000      # what a whole file may become
+_ROWS = 4096                # of an SQLite file that are taken at once
 _STAMP = 12                 # bytes: encapsulation, seconds, nanoseconds
+_SHORT = b'\xff' * _STAMP
 _WINDOW = 128 * 1024 * 1024
 _STAMPED = {'std_msgs/msg/Header', 'builtin_interfaces/msg/Time'}
 UNKNOWN = -1
@@ -76,9 +77,10 @@ class Stamps:
 
     def keep(self, first: int, last: int) -> None:
         """Keep the messages that arrived from one time to another."""
-        kept = [first <= time <= last for time in self.arrival]
+        arrival = np.array(self.arrival)
+        kept = (arrival >= first) & (arrival <= last)
         for name in ('arrival', 'published', 'header'):
-            setattr(self, name, array('q', compress(getattr(self, name), kept)))
+            setattr(self, name, array('q', np.array(getattr(self, name))[kept].tobytes()))
 
 
 class Bag:
@@ -171,14 +173,26 @@ class Bag:
     def _read_mcap(self, file: Path, called: str, topics: Collection[str]) -> None:
         reader = TraceReader(file)
         relative = {topic[1:] for topic in topics}
-        for topic, log_time, publish_time, data in reader.messages({*topics, *relative}):
-            self._add(topic, log_time, publish_time, data)
+        for some in reader.messages({*topics, *relative}):
+            for each in some:
+                self._add(each.topic, each.log_time.view(np.int64),
+                          each.publish_time.view(np.int64), each.heads(_STAMP), each.content)
+            if self._keep is not None:      # in the order of the file
+                for _, which, number in sorted(
+                        (start, which, number) for which, each in enumerate(some)
+                        for number, start in enumerate(each.starts.tolist())):
+                    each = some[which]
+                    self._give(each.topic, int(each.log_time[number]),
+                               int(each.publish_time[number]), each.content(number))
         self.warnings += [renamed(text, reader.path, called) for text in reader.warnings]
         self.topics |= {_absolute(topic.name) for topic in reader.topics.values()}
         self._look_through(reader.times)
 
     def _read_sqlite(self, file: Path, called: str, topics: Collection[str]) -> None:
         times = array('q')
+        known: dict[int, Topic] = {}
+        given: dict[int, list[tuple[int, bytes]]] = {}
+        waiting = 0
         try:
             # immutable: reading must not write next to the file
             with closing(sqlite3.connect(
@@ -199,13 +213,35 @@ class Bag:
                         'FROM messages ORDER BY id', wanted):
                     times.append(time)
                     if data is not None:
-                        self._add(known[number], time, UNKNOWN, bytes(data))
+                        if not isinstance(data, bytes):
+                            raise ValueError('the content of a message is none')
+                        self._give(known[number], time, UNKNOWN, data)
+                        given.setdefault(number, []).append((time, data))
+                        waiting += 1
+                    if waiting >= _ROWS:
+                        self._add_rows(known, given)
+                        waiting = 0
         except Exception as error:      # of SQLite, or caused by damaged data
             what = f'its SQLite storage cannot be read ({" ".join(str(error).split())})'
             if not times:
                 raise BagError(called, what, _REMEDY) from None
             self.warnings.append(f'{called}: {what}: used {len(times)} messages before that')
+        self._add_rows(known, given)
         self._look_through(times)
+
+    def _add_rows(
+        self, known: Mapping[int, Topic], given: dict[int, list[tuple[int, bytes]]]
+    ) -> None:
+        """Take messages of an SQLite file, by number of the topic time and bytes; forget them."""
+        for number, messages in given.items():
+            contents = [data for _, data in messages]
+            times = np.array([time for time, _ in messages], dtype=np.int64)
+            heads = np.frombuffer(b''.join(
+                data[:_STAMP] if len(data) >= _STAMP else _SHORT for data in contents),
+                dtype=np.uint8).reshape(-1, _STAMP)
+            self._add(known[number], times, np.full(len(times), UNKNOWN), heads,
+                      contents.__getitem__)
+        given.clear()
 
     def _called(self, file: Path) -> str:
         return self.name if str(file) == self.path else str(file)
@@ -228,40 +264,60 @@ class Bag:
         """Return the last arrival of any message, ns; None without any."""
         return self.stretches[-1][1] if self.stretches else None
 
-    def _add(self, topic: Topic, arrival: int, published: int, data: bytes) -> None:
-        if not 0 <= arrival < NEVER:
+    def _add(self, topic: Topic, arrival: Ints, published: Ints, heads: Any,
+             content: Callable[[int], bytes]) -> None:
+        """
+        Take messages of a topic.
+
+        :param heads: their first bytes; those of messages that are too short for a stamp are 255.
+        :param content: returns all bytes of one of them.
+        """
+        possible = np.flatnonzero((arrival >= 0) & (arrival < NEVER))
+        if not len(possible):
             return
         name = _absolute(topic.name)
         stamps = self.stamps.get(name)
         if stamps is None:
             stamps = self.stamps[name] = Stamps()
             stamps.type = topic.message_type
-        if self._keep is not None:
-            content = data
-            if content.startswith(_ZSTD):
-                content = _unpacked_message(content, _MESSAGE_LIMIT)
-            self._keep(topic._replace(name=name), arrival, published, content)
-        stamps.arrival.append(arrival)
-        different = 0 < published < NEVER and published != arrival
-        stamps.published.append(published if different else UNKNOWN)
-        stamps.header.append(self._header(topic, data))
+        different = (published > 0) & (published < NEVER) & (published != arrival)
+        headers = self._headers(topic, heads, content)
+        for column, values in ((stamps.arrival, arrival), (stamps.header, headers),
+                               (stamps.published, np.where(different, published, UNKNOWN))):
+            column.frombytes(values[possible].tobytes())
 
-    def _header(self, topic: Topic, data: bytes) -> int:
+    def _give(self, topic: Topic, arrival: int, published: int, data: bytes) -> None:
+        """Give a message to who keeps it."""
+        if self._keep is not None and 0 <= arrival < NEVER:
+            if data.startswith(_ZSTD):
+                data = _unpacked_message(data, _MESSAGE_LIMIT)
+            self._keep(topic._replace(name=_absolute(topic.name)), arrival, published, data)
+
+    def _headers(self, topic: Topic, heads: Any, content: Callable[[int], bytes]) -> Ints:
+        """Return the stamps at the beginning of messages; `UNKNOWN` where there is none."""
         key = (topic.message_type, topic.definition)
         stamped = self._stamped.get(key)
         if stamped is None:
             stamped = self._stamped[key] = topic.encoding == 'cdr' and _is_stamped(topic)
         if not stamped:
-            return UNKNOWN
-        head = data[:_STAMP]
-        if head.startswith(_ZSTD):      # compressed message by message
-            head = _unpacked_message(data, _STAMP)
-        if len(head) < _STAMP or head[0] or head[1] > 1:
-            return UNKNOWN
-        seconds, nanoseconds = struct.unpack('<iI' if head[1] else '>iI', head[4:])
-        if seconds < 0 or nanoseconds >= 1_000_000_000:
-            return UNKNOWN
-        return int(seconds * 1_000_000_000 + nanoseconds)
+            return np.full(len(heads), UNKNOWN)
+        # compressed message by message
+        packed = np.flatnonzero((heads[:, :len(_ZSTD)] == np.frombuffer(_ZSTD, 'u1')).all(axis=1))
+        if len(packed):
+            heads = heads.copy()
+            for number in packed.tolist():
+                head = _unpacked_message(content(number), _STAMP)
+                heads[number] = np.frombuffer(
+                    head if len(head) == _STAMP else b'\1'.ljust(_STAMP), 'u1')
+        times = np.ascontiguousarray(heads[:, 4:])
+        found = np.full(len(heads), UNKNOWN)
+        for order, kind in ((0, '>'), (1, '<')):
+            rows = times.view([('s', f'{kind}i4'), ('ns', f'{kind}u4')]).reshape(-1)
+            seconds, nanoseconds = rows['s'].astype(np.int64), rows['ns'].astype(np.int64)
+            usable = (heads[:, 0] == 0) & (heads[:, 1] == order) & (seconds >= 0) & (
+                nanoseconds < 1_000_000_000)
+            found[usable] = seconds[usable] * 1_000_000_000 + nanoseconds[usable]
+        return found
 
 
 def is_ordinary(path: str) -> bool:

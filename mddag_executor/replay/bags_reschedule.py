@@ -44,15 +44,12 @@ def reschedule_bag(
     counts = np.bincount(run.releases['dag'], minlength=len(task_set.dags)).tolist()
     generator = random.Random(seed)
     return reschedule(run, times=[
-        np.array([_costs(dag, times, generator) for _ in range(count)], dtype=np.int64)
+        np.array([_drawn(dag, generator) for _ in range(count)], dtype=np.int64)
+        if times is None else np.tile(np.array(times[dag.index], dtype=np.int64), (count, 1))
         for dag, count in zip(task_set.dags, counts)], overheads=False, **options)
 
 
-def _costs(
-    dag: Dag, times: Sequence[Sequence[int]] | None, generator: random.Random
-) -> Sequence[int]:
-    if times is not None:
-        return times[dag.index]
+def _drawn(dag: Dag, generator: random.Random) -> Sequence[int]:
     row = []
     for vertex in dag.vertices:
         declared = vertex.callback.execution_time

@@ -23,7 +23,7 @@ from mddag_executor.trace.blocks import open_data, read_summary, Summary
 from mddag_executor.trace.channels import Channels, Topic
 from mddag_executor.trace.errors import TraceError, TraceWarning, unreadable
 from mddag_executor.trace.events import Batch, Event
-from mddag_executor.trace.reading import Message, Reading
+from mddag_executor.trace.reading import Messages, Reading
 from mddag_executor.trace.records import LIBRARY
 from mddag_executor.trace.schema import PROCESS
 
@@ -147,8 +147,12 @@ class TraceReader:
         with self._reading(Channels(set(names), as_table)) as reading:
             yield from reading.by_file()
 
-    def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Yield the undecoded messages of some topics, in the order of the file."""
+    def messages(self, topics: Collection[str]) -> Iterator[list[Messages]]:
+        """
+        Yield the undecoded messages of some topics, some at a time, by channel.
+
+        Those of a channel are in the order of the file.
+        """
         with self._reading(Channels(set(), True)) as reading:
             yield from reading.messages_of(topics, self.times, self._summary)
 

@@ -54,13 +54,33 @@ _INDEX_HEAD = 6         # bytes: channel, size of the entries
 _INDEX_ENTRY = np.dtype([('time', '<u8'), ('offset', '<u8')])
 
 
-class Message(NamedTuple):
-    """A message: its channel, its times (ns) and its bytes."""
+class Messages(NamedTuple):
+    """
+    Messages of a channel, valid until the next ones are read.
+
+    :ivar log_time: their times (ns), and ``publish_time``.
+    :ivar starts: where their bytes begin in ``data``; ``sizes``: how many these are.
+    """
 
     topic: Topic
-    log_time: int
-    publish_time: int
-    data: bytes
+    log_time: Any
+    publish_time: Any
+    starts: Ints
+    sizes: Ints
+    data: bytearray
+
+    def content(self, number: int) -> bytes:
+        """Return the bytes of a message."""
+        start = int(self.starts[number])
+        return bytes(self.data[start:start + int(self.sizes[number])])
+
+    def heads(self, size: int) -> Any:
+        """Return the first bytes of each message as a row; all of a shorter one are 255."""
+        found = np.full((len(self.starts), size), 255, dtype=np.uint8)
+        long = self.sizes >= size
+        found[long] = rows_at(self.data, np.dtype(f'V{size}'), self.starts[long]).view(
+            np.uint8).reshape(-1, size)
+        return found
 
 
 class _Loaded(NamedTuple):
@@ -125,8 +145,8 @@ class Reading:
 
     def messages_of(
         self, topics: Collection[str], times: array[int], summary: Summary | None
-    ) -> Iterator[Message]:
-        """Yield the messages of some topics; add the times of all messages to ``times``."""
+    ) -> Iterator[list[Messages]]:
+        """Yield messages of some topics, by channel; add the times of all to ``times``."""
         known = self._channels.topics
         self._choose(topics, summary)
         for data, at, lengths, channels in self._messages():
@@ -135,12 +155,14 @@ class Reading:
             undefined = channels[~np.isin(channels, list(known))]
             self._undecoded.update(
                 f'channel {channel}: {UNDEFINED}' for channel in undefined.tolist())
-            wanted = np.isin(channels, [n for n in known if known[n].name in topics])
-            for start, length, channel, (log_time, publish_time) in zip(
-                    at[wanted].tolist(), lengths[wanted].tolist(), channels[wanted].tolist(),
-                    heads[wanted].tolist()):
-                yield Message(known[channel], log_time, publish_time,
-                              bytes(data[start + _LEAST:start + _CONTENT + length]))
+            found = []
+            for channel in np.unique(channels).tolist():
+                if channel in known and known[channel].name in topics:
+                    mine = np.flatnonzero(channels == channel)
+                    found.append(Messages(
+                        known[channel], heads['log_time'][mine], heads['publish_time'][mine],
+                        at[mine] + _LEAST, lengths[mine] - records.MESSAGE_HEAD.size, data))
+            yield found
         for each in self._skipped:
             times.frombytes(each.tobytes())
 

@@ -39,7 +39,7 @@ def header(stamp):
 
 
 def write(path, types, messages, storage=MCAP, compression=None, version=9):
-    """Write a bag; `types` by topic, `messages`: topic, arrival and message."""
+    """Write a bag; `types` by topic, `messages`: topic, arrival and message, or its bytes."""
     writer = Writer(path, version=version, storage_plugin=storage)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
@@ -47,7 +47,8 @@ def write(path, types, messages, storage=MCAP, compression=None, version=9):
         connections = {topic: writer.add_connection(topic, kind, typestore=STORE)
                        for topic, kind in types.items()}
         for topic, arrival, message in messages:
-            writer.write(connections[topic], arrival, STORE.serialize_cdr(message, types[topic]))
+            writer.write(connections[topic], arrival, message if isinstance(
+                message, bytes) else STORE.serialize_cdr(message, types[topic]))
     return path
 
 

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import sqlite3
+import struct
 
 from mcap.writer import Writer as McapWriter
 from mddag_executor import open_recording
@@ -284,6 +285,33 @@ def test_a_message_at_a_time_that_cannot_be(tmp_path, storage, odd):
     assert [line.split(': ', 1)[1] for line in outcome.warnings] == [
         'left out: 1 message at an impossible time']
     assert outcome.result()['dags'] == sound.result()['dags']
+
+
+@pytest.mark.parametrize('storage', [MCAP, SQLITE])
+def test_stamps_of_each_byte_order_and_of_short_messages(tmp_path, storage):
+    """What is no stamp is unknown, each message by itself; one of them is at the file's end."""
+    plain = b'\0\1\0\0' + struct.pack('<iI', 5, 6) + bytes(8)
+    contents = [plain, b'\0\0\0\0' + struct.pack('>iI', 7, 8) + bytes(8), b'\0\0', b'', plain[:11],
+                b'\0\2' + plain[2:], b'\1' + plain[1:], plain[:4] + struct.pack('<iI', -1, 0),
+                plain[:4] + struct.pack('<iI', 1, 10 ** 9), plain[:12], plain[:6]]
+    path = write(tmp_path / 'bag', {'/points': HEADER}, [
+        ('/points', BEGIN + k, content) for k, content in enumerate(contents)], storage)
+    bag = Bag(path, {'/points'})
+    assert bag.warnings == [] and list(bag.stamps['/points'].arrival) == [
+        BEGIN + k for k in range(len(contents))]
+    assert list(bag.stamps['/points'].header) == [
+        5_000_000_006, 7_000_000_008, -1, -1, -1, -1, -1, -1, -1, 5_000_000_006, -1]
+
+
+@pytest.mark.parametrize('storage', [MCAP, SQLITE])
+def test_messages_are_kept_in_the_order_of_the_file(tmp_path, storage):
+    """Of several topics, also those of one time: a rerun delivers them in that order."""
+    wanted = [(('/b', '/a', '/c')[k % 3], BEGIN + k // 4) for k in range(60)]
+    path = write(tmp_path / 'bag', dict.fromkeys(('/a', '/b', '/c'), HEADER), [
+        (topic, time, bytes(8)) for topic, time in wanted], storage)
+    kept = []
+    Bag(path, {'/a', '/b'}, keep=lambda topic, time, *_: kept.append((topic.name, time)))
+    assert kept == [(topic, time) for topic, time in wanted if topic != '/c']
 
 
 def test_a_pause_has_no_jobs_of_timers(tmp_path):
