@@ -279,7 +279,7 @@ def table(values: Kind, names: Name | None = None) -> Kind:
 
 def name(what: Name) -> Kind:
     """Return the kind of a name."""
-    return scalar(what.check, what.schema)
+    return scalar(what.check, what.schema, what=f'a {what.what} name')
 
 
 def choice(
@@ -342,7 +342,12 @@ NO_DEADLINE = 'none'
 
 
 def _deadline(text: str) -> int | str:
-    return NO_DEADLINE if text == NO_DEADLINE else parse_duration(text, minimum_ns=MICROSECOND)
+    if text == NO_DEADLINE:
+        return NO_DEADLINE
+    try:
+        return parse_duration(text, minimum_ns=MICROSECOND)
+    except ValueProblem as error:
+        raise ValueProblem(error.problem, f"{error.remedy}, or 'none'") from None
 
 
 def _weakly_hard(text: str) -> WeaklyHard:

@@ -1,13 +1,14 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Eight ordinary nodes: each sink takes times of its own, to compare them with the verdicts.
+Eleven ordinary nodes: each sink takes times of its own, to compare them with the verdicts.
 
     python examples/ordinary_robot/robot.py
 
 The detector publishes an alarm only when it sees a person, and needs 150 ms for every second one,
 so that the brake is late.  A timer fires once, a button is pressed now and then, and the planner
-only stores what the IMU measures.
+only stores what the IMU measures.  The fusion combines each scan of the lidar with the next boxes,
+which have another rate.
 """
 
 from __future__ import annotations
@@ -99,6 +100,32 @@ class Planner(Part):
         self.done('plan', message)
 
 
+class Fusion(Part):
+    """Combine each scan with the next boxes."""
+
+    def __init__(self) -> None:
+        super().__init__('fusion')
+        self.points: Header | None = None
+        self.objects = self.create_publisher(Header, '/objects', 10)
+        self.create_subscription(Header, '/points', self.on_points, 10)
+        self.create_subscription(Header, '/boxes', self.on_boxes, 10)
+
+    def on_points(self, points: Header) -> None:
+        self.points = points
+
+    def on_boxes(self, boxes: Header) -> None:
+        if self.points is not None:
+            self.objects.publish(self.points)
+            self.points = None
+
+
+class Tracker(Part):
+    def __init__(self) -> None:
+        super().__init__('tracker')
+        self.create_subscription(
+            Header, '/objects', lambda points: self.done('track', points), 10)
+
+
 class Bringup(Part):
     def __init__(self) -> None:
         super().__init__('bringup')
@@ -120,7 +147,8 @@ class Panel(Part):
 def main() -> None:
     rclpy.init()
     parts = [Source('camera', 0.1, '/image'), Detector(), Brake(), Mapper(),
-             Source('imu', 0.02, '/imu'), Planner(), Bringup(), Panel()]
+             Source('imu', 0.02, '/imu'), Planner(), Source('lidar', 0.3, '/points'), Fusion(),
+             Tracker(), Bringup(), Panel()]
     user = Source('user', 0.7, '/button')   # not declared: a person
     executor = MultiDeadlineExecutor(str(GRAPH))
     for node in [*parts, user]:

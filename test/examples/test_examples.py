@@ -126,7 +126,11 @@ def test_ordinary_robot():
     found = {m[1]: tuple(map(int, m.groups()[1:])) for m in map(re.compile(
         r'(\S+): itself (\d+) results, (\d+) late; judged (\d+) results, (\d+) late, '
         r'(\d+) not due in (\d+) jobs').fullmatch, run('ordinary_robot').splitlines())}
-    assert set(found) == {'/brake:stop', '/planner:plan', '/panel:lamp', '/panel:pressed'}
+    assert set(found) == {
+        '/brake:stop', '/planner:plan', '/tracker:track', '/panel:lamp', '/panel:pressed'}
+    own, own_late, completed, late, _, _ = found.pop('/tracker:track')
+    # on a busy machine the fusion skips a scan, which completes with the next one
+    assert own >= 3 and abs(own - completed) <= 2 and own_late <= late
     for own, own_late, completed, late, _, _ in found.values():
         assert 0 <= own - completed <= 1    # one may have expired on a busy machine
         assert own_late <= late     # the verdicts also count how late a timer was

@@ -105,3 +105,34 @@ def test_a_file_full_of_errors(call):
         shown = done.stderr.splitlines()
         assert (done.returncode, len(shown)) == (2, MOST_ERRORS + 1)
         assert shown[-1] == 'error: <stdin>: there may be more errors: correct these first'
+
+
+STARTS = {
+    'timer': 'timer: 10ms', 'source': 'subscription: /out, period: 10ms',
+    'subscription': 'subscription: /a', 'sync': 'sync: [/a, /b]',
+    'driven': 'sync: {topics: [/a, /b], driven_by: /a}', 'service': 'service: /srv, period: 1s'}
+VALUES = {
+    'once': ('true', 'false', 'yes', '1', '[true]', '{a: b}', "''", ''),
+    'sporadic': ('true', 'yes', '1', '[true]', ''),
+    'may_publish': ('[/x]', '/x', '[x]', '[/x, /x]', '[/c]', '[/a]', '{/x: 1}', '[]', '[[/x]]',
+                    ''),
+    'deadline': ('none', 'None', 'never', 'no', '0', '-1ms', '[none]', 'none, tolerate: 1 of 9',
+                 'none, importance: high', 'none, keep: newest', ''),
+    'driven_by': ('/a', '[/a]')}
+
+
+def test_wrong_uses_of_the_keys_of_ordinary_robots():
+    """One line each, which says where, what and what to do; golden/wrong_uses.txt has them all."""
+    found = []
+    for what, start in STARTS.items():
+        for key, values in VALUES.items():
+            for value in values:
+                keys = f'{start}, publishes: [/c], {key}: {value}'
+                text = (HEAD + '  - {name: t, timer: 9ms, publishes: [/a, /b]}\n'
+                        '  - {name: u, subscription: /a, deadline: 9ms}\n'
+                        f'  - {{name: s, {keys}' + ', deadline: 9ms' * (key != 'deadline') + '}\n')
+                errors = errors_of(loads, text, 'g.yaml')
+                assert len(errors) <= 1 + (value == '[/a]')     # a cycle, and no sink
+                line = errors[0].split('callback ', 1)[1] if errors else 'accepted'
+                found.append(f'{what}, {key}: {value} -> {line}')
+    golden.compare('wrong_uses', '\n'.join(found) + '\n', GOLDEN)
