@@ -155,12 +155,18 @@ class Engine:
 
     # --- ready work --- --------------------------------------------------------------------------
 
-    def taken(self, entity: Entity, message: Any, source_timestamp: int, now: int) -> None:
-        """Record that a message was taken at ``now``, which is not after it became ready."""
+    def taken(
+        self, entity: Entity, message: Any, source_timestamp: int, number: int | None, now: int
+    ) -> None:
+        """
+        Record that a message was taken at ``now``, which is not after it became ready.
+
+        :param number: its number among the messages of its publisher, if known.
+        """
         assert self.record is not None
         self.record(
             'rmw_take', now, get_native_id(), id(entity.rclpy), id(message), source_timestamp,
-            True)
+            True, number or 0)
 
     def never_taken(self, entity: Entity, count: int, now: int) -> None:
         """Note that the middleware dropped messages (see ``gaps``), as the next one shows."""

@@ -160,7 +160,8 @@ class SubscriptionSource(Source):
         now = self._pool.now
         if engine.record is not None:
             now = self._pool.tick()  # it becomes ready right after it was taken
-            engine.taken(entity, message, stamp, now)
+            engine.taken(
+                entity, message, stamp, info.get('publication_sequence_number'), now)
         if entity.callback is None:
             engine.ready(work, now)
             return

@@ -52,15 +52,17 @@ KINDS: dict[str, tuple[Any, ...]] = {
     'ros2:rclcpp_ring_buffer_dequeue': (DEQUEUE, 'buffer', 'index'),
     'mddag:lost': (LOST, 'count'),
 }
-"""By full name of an event its kind, and the fields of its columns ``a``, ``b`` and ``c``."""
+"""By full name of an event its kind, and the fields of its columns ``a``, ``b``, …"""
 OWN_KINDS: dict[str, tuple[Any, ...]] = {
-    'mddag:dispatch': (READY, 'callback', 'ready'), 'mddag:shutdown': (SHUTDOWN, 'end')}
+    'mddag:dispatch': (READY, 'callback', 'ready'), 'mddag:shutdown': (SHUTDOWN, 'end'),
+    'ros2:rmw_take': (
+        TAKE, 'rmw_subscription_handle', 'source_timestamp', 'taken', 'sequence_number')}
 """The same of this executor's own events, for a trace without declaration."""
 
 _INIT_TIME = 'init_timestamp'
 """The field of a timer's initialisation that is a time."""
 _EVENT = np.dtype([('time', 'i8'), ('place', 'i8'), ('thread', 'i8'), ('kind', 'i1'),
-                   ('a', 'i8'), ('b', 'i8'), ('c', 'i8')])
+                   ('a', 'i8'), ('b', 'i8'), ('c', 'i8'), ('d', 'i8')])
 
 
 class Events(NamedTuple):
@@ -161,7 +163,7 @@ def _normal(events: Any, places: Ints, kind: tuple[Any, ...]) -> Table:
     found['time'], found['place'], found['kind'] = events['timestamp'], places, kind[0]
     found['thread'] = (events['vpid'].astype(np.int64) << 32) | (
         events['vtid'].astype(np.int64) & 0xFFFFFFFF)
-    for name, fields in zip('abc', kind[1:]):
+    for name, fields in zip('abcd', kind[1:]):
         for field in reversed(fields.split()):
             if field in (events.dtype.names or ()):
                 value = events[field].astype(np.int64)

@@ -237,7 +237,7 @@ class Links:
     def _runs(self) -> Table:
         """Return the executions (rule 1)."""
         table = self.events
-        begin, end_at = np.array(self._stack(), dtype=np.int64).reshape(-1, 2).T
+        begin, end_at = self._stack()
         runs = rows(_RUN, len(begin))
         runs['callback'], runs['at'], runs['end_at'] = self._callback[begin], begin, end_at
         runs['thread'], runs['start'] = table['thread'][begin], table['time'][begin]
@@ -249,19 +249,48 @@ class Links:
                 self.losses.count('unknown', callback.label, times)
         return runs
 
-    def _stack(self) -> list[list[int]]:
-        """Return the first and last event of executions, with a stack for each thread."""
+    def _stack(self) -> tuple[Ints, Ints]:
+        """Return the first and last event of executions."""
         table = self.events
         at = np.flatnonzero(table['kind'] <= END)
+        is_start = table['kind'][at] == START
+        begin, run = at[is_start], np.cumsum(is_start) - 1
+        end_at = np.full(len(begin), -1)
         #: By event of a start or end the execution that runs after it in the thread, or -1.
         self._top = np.full(len(table), -1)
+        # in most threads each start is followed by the end of the same callback
+        order = sort_by(table['thread'][at])
+        thread, number, starts = (
+            each[order] for each in (table['thread'][at], self._callback[at], is_start))
+        same = np.append(False, thread[1:] == thread[:-1])[:len(at)]
+        follows = same & np.append(False, starts[:-1])[:len(at)]    # a start
+        fits = np.where(starts, ~follows, follows & np.append(
+            False, number[1:] == number[:-1])[:len(at)])
+        simple = np.ones(len(self._pid), dtype=np.bool_)
+        simple[thread[~fits]] = False
+        ends = np.flatnonzero(~starts & simple[thread])
+        end_at[run[order[ends - 1]]] = at[order[ends]]
+        begins = order[starts & simple[thread]]
+        self._top[at[begins]] = run[begins]
+        others = np.flatnonzero(~simple[table['thread'][at]])
+        self._nest(at[others], run[others], end_at)
+        return begin, end_at
+
+    def _nest(self, at: Ints, runs: Ints, end_at: Ints) -> None:
+        """
+        Find the ends of executions in threads with nested executions, or with events missing.
+
+        :param at: starts and ends; ``runs``: of each the last execution that started.
+        """
+        table = self.events
         stacks: dict[int, list[int]] = {}
-        found: list[list[int]] = []
-        callback: list[int] = []
-        inner: list[int] = []       # last start of a nested execution
+        callback: dict[int, int] = {}
+        inner: dict[int, int] = {}      # last start of a nested execution
         top: list[int] = []
-        for here, thread, kind, number, now in zip(at.tolist(), *(each[at].tolist() for each in (
-                table['thread'], table['kind'], self._callback, table['time']))):
+        for here, thread, kind, number, now, new in zip(at.tolist(), *(
+                each[at].tolist() for each in (
+                    table['thread'], table['kind'], self._callback, table['time'])),
+                runs.tolist()):
             fresh = thread not in stacks
             stack = stacks.setdefault(thread, [])
             known = any(callback[run] == number for run in stack)
@@ -274,14 +303,12 @@ class Links:
                             break
                 if stack:
                     inner[stack[-1]] = now
-                stack.append(len(found))
-                found.append([here, -1])
-                callback.append(number)
-                inner.append(-1)
+                stack.append(new)
+                callback[new] = number
             elif known:
                 while callback[run := stack.pop()] != number:
                     self._without_end(here, callback[run], run, now)
-                found[run][1] = here
+                end_at[run] = here
             elif not fresh or self.callbacks[number].made >= self.who.begin:
                 # otherwise it began before the recording
                 self.losses.count('starts', self.callbacks[number].label)
@@ -290,9 +317,8 @@ class Links:
         self._top[at] = top
         for stack in stacks.values():
             for run in stack:
-                if inner[run] >= 0:
+                if run in inner:
                     self._without_end(len(table), callback[run], run, inner[run])
-        return found
 
     def _without_end(self, at: int, callback: int, run: int, now: int) -> None:
         self.losses.count('ends', self.callbacks[callback].label)
@@ -468,7 +494,7 @@ class Links:
         by_address: dict[tuple[int, int], int] = {}
         by_slot: dict[tuple[int, int, int], int] = {}
         for here, thread in zip(at.tolist(), table['thread'][at].tolist()):
-            pid, (_, _, _, what, a, b, c) = self._pid[thread], table[here].item()
+            pid, (_, _, _, what, a, b, c, _) = self._pid[thread], table[here].item()
             if what == INTRA:
                 by_address[pid, b] = int(self._row[here])
             elif what == COPY:

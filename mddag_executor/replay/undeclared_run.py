@@ -13,8 +13,8 @@ the causes of executions.  Differences:
    message that its subscription took until then.
 2. *Publications to messages.*  A publication is recorded just before sending; its source timestamp
    is not recorded.  A timestamp belongs to a publication of its topic that was being sent then: it
-   had begun, and its thread had neither published again nor ended its callback.  Each publication
-   has one timestamp.  If several publications fit, the publication is unknown.
+   had begun, and its thread had neither published again nor ended its callback.  If several
+   publications fit, the number of the message decides (``stamps``).
 3. *Ready* is recorded.  A timer's release is the last time on its period's grid.  The grid's
    origin is not recorded.  It is the earliest time at which the timer was noticed, if half of the
    releases on that grid were noticed shortly after they were due; otherwise a release is the time
@@ -24,8 +24,6 @@ the causes of executions.  Differences:
 """
 
 from __future__ import annotations
-
-from bisect import bisect_right
 
 from mddag_executor.recording.columns import rows
 from mddag_executor.recording.entities import INIT_EVENTS
@@ -40,6 +38,7 @@ from mddag_executor.recording.tables import (
     NOTHING,
     Recording,
     rows_by,
+    sort_by,
     UNKNOWN,
 )
 from mddag_executor.replay.imported_events import (
@@ -54,49 +53,13 @@ from mddag_executor.replay.imported_events import (
 from mddag_executor.replay.imported_jobs import ImportedJobs
 from mddag_executor.replay.imported_run import ImportedRun
 from mddag_executor.replay.links import Links
+from mddag_executor.replay.stamps import find_stamps, Sent
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
 _DROP, _MESSAGES_LOST = 'mddag:drop', 'mddag:messages_lost'
-_ROUNDING_NS = 1_000        # of the two clocks that stamp and publication are read from
-_UNSENT = 256               # publications of a topic without a timestamp that are compared
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
-
-
-class _Sent:
-    """
-    The publications of a topic in the order of time.
-
-    :ivar rows: of the messages.
-    :ivar stamps: their source timestamps; 0: unknown.
-    """
-
-    def __init__(self, rows: Ints, times: list[int], ends: list[int]) -> None:
-        self.rows = rows
-        self.stamps = [0] * len(times)
-        self._times, self._ends = times, ends
-        #: By publication the last one before it that was being sent longer, or -1.
-        self._longer: list[int] = []
-        for place, end in enumerate(ends):
-            before = place - 1
-            while before >= 0 and ends[before] <= end:
-                before = self._longer[before]
-            self._longer.append(before)
-
-    def being_sent(self, stamp: int) -> list[int]:
-        """Return the publications without timestamp that were being sent at a time."""
-        last = bisect_right(self._times, stamp + _ROUNDING_NS)
-        least, begun = last - _UNSENT, stamp - _ROUNDING_NS
-        fits, place = [], last - 1
-        while place >= max(0, least):
-            if self._ends[place] < begun:
-                place = self._longer[place]     # all between them had ended before
-                continue
-            if not self.stamps[place]:
-                fits.append(place)
-            place -= 1
-        return fits
 
 
 class _OwnLinks(Links):
@@ -115,24 +78,22 @@ class _OwnLinks(Links):
         at = np.flatnonzero(stops)
         mine = (before >= 0) & sent[before]
         ends[self._row[before[mine]]] = table['time'][at[mine]]
-        published = [_Sent(rows, found['time'][rows].tolist(), ends[rows].tolist())
-                     for rows in rows_by(self.topic_of, len(self.topics) + 1)]
         takes = np.flatnonzero((kind == TAKE) & (self._subscription >= 0))
         topics = self._numbers(each[0].start for each in self.taken)[self._subscription[takes]]
-        known: set[tuple[int, int]] = set()
+        # several subscriptions may take a message: its first take counts
+        order = sort_by(topics, table['b'][takes])
+        stamps = table['b'][takes[order]]
+        new = np.append(True, (np.diff(topics[order]) != 0) | (np.diff(stamps) != 0))[:len(takes)]
+        first = np.sort(order[new])
+        takes, topics = takes[first], topics[first]
         several: list[tuple[int, int]] = []
-        for topic, stamp in zip(topics.tolist(), table['b'][takes].tolist()):
-            if (topic, stamp) in known:
-                continue
-            fits = published[topic].being_sent(stamp)
-            if fits:
-                known.add((topic, stamp))
-            if len(fits) == 1:
-                published[topic].stamps[fits[0]] = stamp
-            elif fits:
-                several.append((topic, stamp))
-        for sent_on in published:
-            found['stamp'][sent_on.rows] = sent_on.stamps
+        for topic, (mine, asked) in enumerate(zip(*(
+                rows_by(each, len(self.topics) + 1) for each in (self.topic_of, topics)))):
+            at = takes[asked]
+            found['stamp'][mine], doubtful = find_stamps(
+                Sent(found['time'][mine], ends[mine], found['publisher'][mine]),
+                table['b'][at], table['d'][at])
+            several += [(topic, stamp) for stamp in doubtful]
         return np.array(several, dtype=np.int64).reshape(-1, 2)
 
     def _takes(self) -> tuple[Ints, Ints]:

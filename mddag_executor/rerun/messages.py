@@ -314,7 +314,7 @@ class Messages:
             if stamp < 0:
                 stamp = now  # a job of its own
         if engine.record is not None:
-            engine.taken(entity, message, source_stamp, now)
+            engine.taken(entity, message, source_stamp, number, now)
         engine.arrived(Work(entity, entity.rclpy.callback, args), origin, release, stamp, now)
 
     def _message(self, entity: Entity, data: bytes) -> Any:

@@ -116,8 +116,9 @@ _ALL = (
     _event('ros2', 'rclcpp_publish',
            publisher_handle=_U64, message=_U64, message_timestamp=_U64),
     _event('ros2', 'rcl_publish', publisher_handle=_U64, message=_U64),
-    _event('ros2', 'rmw_take', rmw_subscription_handle=_U64, message=_U64,
-           source_timestamp=_I64, taken=_BOOL),
+    # the number that the middleware gave the message among those of its publisher, 0: unknown
+    _event('ros2', 'rmw_take', (0,), rmw_subscription_handle=_U64, message=_U64,
+           source_timestamp=_I64, taken=_BOOL, sequence_number=_I64),
     # CARET
     _event('ros2_caret', 'caret_init', clock_offset=_I64, distribution=_STR),
     _event('ros2_caret', 'rmw_implementation', rmw_impl=_STR),

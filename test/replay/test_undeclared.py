@@ -4,12 +4,15 @@
 
 import bisect
 import itertools
+import json
 from pathlib import Path
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.replay import undeclared_run
+from mddag_executor.replay import stamps_without_numbers
+from mddag_executor.replay.stamps import find_stamps, Sent
 from mddag_executor.trace import EVENTS, TraceFile, TraceReader
+import numpy as np
 import pytest
 
 from .helpers import MS, ns, Written
@@ -63,13 +66,15 @@ class Run(Written):
         self.takes(sent + 0.009, sent + 0.099)
         self.runs(RUN, sent + 0.101, sent + 0.101 + took, ready=sent + 0.1)
 
-    def result(self, until=None):
+    def result(self, until=None, status=0):
         """End the run and return what `mddag replay --json` says of it."""
         if until is None:
             self.file.finish()
         else:
             self.end(until)
-        return self.call('replay', self.path, self.graph, '--json', '-').result
+        done = self.call('replay', self.path, self.graph, '--json', '-')
+        assert done.returncode == status, done.stderr
+        return json.loads(done.stdout)
 
 
 @pytest.fixture
@@ -152,7 +157,7 @@ def test_who_published_is_never_guessed(in_order, run):
         run.takes(at + 2.01, at + 31)
         run.runs(RUN, at + 30.001, at + 32)
         run.runs(RUN, at + 33, at + 35, ready=at + 31.001)
-    result = run.result(300)
+    result = run.result(300, status=0 if in_order else 2)
     sinks = [of_camera(result, dag) for dag in result['dags']]
     if in_order:
         assert [sink['response_ns']['max'] for sink in sinks] == [32 * MS, 35 * MS]
@@ -241,11 +246,11 @@ class Counted(list):
 @given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 60)), max_size=40), st.data())
 def test_publications_that_were_being_sent_are_found(sent, data):
     """As by comparing all of the last ones."""
-    module = undeclared_run
-    rounding, most = module._ROUNDING_NS, module._UNSENT
+    module = stamps_without_numbers
+    rounding, most = module.ROUNDING_NS, module._UNSENT
     times = [rounding * each for each in itertools.accumulate(gap for gap, _ in sent)]
     ends = [time + rounding * took for time, (_, took) in zip(times, sent)]
-    topic = module._Sent(None, times, ends)
+    topic = module.BeingSent(times, ends)
     topic.stamps = data.draw(st.lists(st.sampled_from((0, 1)), min_size=len(sent),
                                       max_size=len(sent)))
     stamp = data.draw(st.integers(0, 400 * rounding))
@@ -258,9 +263,48 @@ def test_publications_that_were_being_sent_are_found(sent, data):
 def test_a_message_is_not_compared_with_all_publications():
     """Not even if one of them, of a thread that was killed, has no end."""
     times = [100_000 * n for n in range(1_000)]
-    topic = undeclared_run._Sent(None, times, Counted(
+    topic = stamps_without_numbers.BeingSent(times, Counted(
         [2 ** 62 if n == 500 else time + 50_000 for n, time in enumerate(times)]))
     Counted.reads = 0
     for place, time in enumerate(times):
         assert topic.being_sent(time + 20_000) == [place, *[500] * (500 < place < 756)]
     assert Counted.reads < 5 * len(times)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 30), st.integers(0, 90),
+                          st.integers(0, 3)), max_size=40), st.randoms(use_true_random=False))
+def test_publications_of_numbered_messages_are_never_wrong(several, random):
+    """Three publishers send at once, some messages are lost, and some are not recorded."""
+    us, now, counts, rows = 1_000, 0, [0, 5, 900], []
+    for publisher, gap, took, unseen in several:
+        now += (1 + 3 * gap) * us
+        counts[publisher] += 1 + unseen // 3        # outside callbacks
+        rows.append((now, now + took * us, publisher, counts[publisher],
+                     now + random.randint(0, took) * us))
+    begins, ends, publishers, numbers, stamps = (
+        np.array(each, dtype=np.int64) for each in (zip(*rows) if rows else [()] * 5))
+    taken = [row for row in range(len(rows)) if random.random() < 0.9 and stamps[row] not in
+             np.delete(stamps, row)]
+    random.shuffle(taken)
+    sent = Sent(begins, ends, publishers)
+    found, unknown = find_stamps(sent, stamps[taken], numbers[taken])
+    truth = np.where(np.isin(np.arange(len(rows)), taken), stamps, 0)
+    open_then = [((begins <= each + us) & (ends >= each - us)).sum() for each in stamps[taken]]
+    # a message is wrong only if that of the publication that was being sent then is lost
+    lost = set(range(len(rows))) - set(taken)
+    assert all(found[row] in (0, truth[row]) or row in lost for row in range(len(rows)))
+    if max(open_then, default=0) <= 1:
+        assert found.tolist() == truth.tolist() and unknown == []
+
+
+def test_numbers_decide_between_publications_at_the_same_time():
+    us = 1_000
+    begins = np.arange(6) * 100 * us
+    ends = begins + np.array([50, 50, 250, 50, 50, 50]) * us    # the third one overlaps the next
+    sent = Sent(begins, ends, np.zeros(6, dtype=np.int64))
+    stamps = begins + 10 * us
+    for numbers, known in ((np.arange(6) + 7, True), (np.zeros(6, dtype=np.int64), False)):
+        taken = np.array([3, 2, 0, 1, 4, 5])    # in another order
+        found, unknown = find_stamps(sent, stamps[taken], numbers[taken])
+        assert (found == stamps).all() or not known
+        assert unknown == [] or not known
