@@ -27,7 +27,7 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
 5.  *Waiting, not starving.*  A thread that has not computed since the last check may have waited
     for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU for
     ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
-    ``SWITCH_INTERVAL_S``.  It also did if, for an eighth of the time, it was not ready to run and
+    ``SWITCH_INTERVAL_S``.  It also did if, for a quarter of the time, it was not ready to run and
     no other thread computed.  Anything else is unclear, and counts only after ``LATELY`` checks,
     so that the GIL is not withheld from others for ever.
 """
@@ -72,7 +72,7 @@ SELDOM = 32
 
 CHECK_NS = 2_000_000
 LAST_CHECK_NS = 10 * CHECK_NS
-CHECK_PART = 4
+CHECK_PART = 2
 """
 The interval between checks grows from the first to the last; short callbacks use the last.
 
@@ -340,7 +340,7 @@ class GilCheck:
                 return True
             others = max(0, new.process - last.process - own)
             delayed = new.schedule.delay_ns - last.schedule.delay_ns
-            if 8 * (passed - others - delayed) >= passed:
+            if 4 * (passed - others - delayed) >= passed:
                 return True
         self._unclear += 1
         return self._unclear >= LATELY

@@ -53,8 +53,8 @@ class LocalDelivery:
         self._is_held = False
 
     def hold(self) -> None:
-        """Pause announcements, if they would wake a thread that waits in the epoll."""
-        if self._pool.polling:
+        """Pause announcements, if a thread waits for them, or may look for them."""
+        if self._pool.has_idle_threads():
             try:
                 self._pool.loop.hold(self.sources)
             finally:

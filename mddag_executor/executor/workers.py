@@ -377,6 +377,10 @@ class WorkerPool:
             self._has_called = True
             self.parking.call()
 
+    def has_idle_threads(self) -> bool:
+        """Return whether any thread waits for events, or may look for them."""
+        return bool(self.polling or self._n_parked)
+
     def is_busy(self) -> bool:
         """Return whether any execution runs on a worker."""
         return self.engine.idle_workers < self.engine.n_workers
