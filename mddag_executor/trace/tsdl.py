@@ -175,6 +175,7 @@ class Metadata:
 _TOKEN = re.compile(
     r'/\*.*?\*/|//[^\n]*|\s+|("(?:[^"\\\n]|\\.)*"|:=|\.\.\.|->|[A-Za-z_][A-Za-z0-9_]*'
     r'|[0-9][0-9A-Za-z]*|\S)', re.DOTALL)
+_ODD = frozenset('!"#$%&\'*+/?@\\^`|~')     # outside of texts and comments
 _CONTROL = re.compile(r'[\0-\x08\x0e-\x1f\x7f]')
 _WORD = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
 _NUMBER = re.compile(r'-?(0[xX][0-9a-fA-F]{1,16}|0[bB][01]{1,64}|[0-9]{1,20})[uUlL]{0,3}')
@@ -200,7 +201,11 @@ def parse_tsdl(data: bytes) -> Metadata:
         raise TsdlError(f'it is no text at byte {error.start}') from None
     if _CONTROL.search(text):
         raise TsdlError('it has control characters')
-    return _Parser([token for token in _TOKEN.findall(text) if token]).parse()
+    tokens = [token for token in _TOKEN.findall(text) if token]
+    odd = _ODD.intersection(tokens)
+    if odd:
+        raise TsdlError(f'it has {min(odd)} where it cannot be')
+    return _Parser(tokens).parse()
 
 
 def _plain(name: str) -> str:

@@ -217,6 +217,7 @@ DOUBLED = ' '.join(f'struct a{n + 1} {{ struct a{n} x; struct a{n} y; }};' for n
     ('', 'uint32_t a' + '[2]' * 40 + ';', 'not understood'),
     ('', 'unknown_t a;', 'not understood'), ('', 'uint32_t a; uint32_t a;', 'not understood'),
     (' ' * 9_000_000, 'uint32_t a;', 'larger than 8 MiB'), ('\0', 'uint32_t a;', 'control char'),
+    ('', 'integer { size = 8; base = 1#; } a;', 'it has # where'), ('"', '', 'it has " where'),
     ('', 'uint32_t a[999999999];', 'longer than its event'),
     ('', 'uint32_t a[999999999][999999999];', 'longer than its event'),
     ('', 'uint32_t n; uint8_t a[n]; uint8_t b[n];', 'longer than its event'),
