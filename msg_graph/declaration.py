@@ -50,11 +50,13 @@ def parse_declaration(
     entries: dict[str, Entry] = {}
     found = Collector()
     workers = found(top.get, 'workers')
-    callbacks = found(_callbacks, top, file, entries)
+    concurrent: list[str] = []
+    callbacks = found(_callbacks, top, file, entries, concurrent)
     paths = found(_paths, top, entries)
     found.check()
     processes = read_processes(top, (callback.node for callback in callbacks))
-    return TaskSet((), tuple(callbacks), (), tuple(paths), workers, file, text, processes), entries
+    return TaskSet((), tuple(callbacks), (), tuple(paths), workers, file, text, processes,
+                   tuple(concurrent)), entries
 
 
 def read_processes(top: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
@@ -98,11 +100,15 @@ def processes_text(processes: Iterable[Process]) -> str:
     return text
 
 
-def _callbacks(top: Entry, file: str, entries: dict[str, Entry]) -> list[Callback]:
+def _callbacks(
+    top: Entry, file: str, entries: dict[str, Entry], concurrent: list[str]
+) -> list[Callback]:
     def of_node(numbered: tuple[int, Tree]) -> list[Callback]:
         entry = Entry(numbered[1], f'node {numbered[0]}', NODE_KEYS)
         node = entry.get('node')
         entry.name = f'node {shown(node)}'
+        if entry.get('concurrent'):
+            concurrent.append(node)
         return for_each(enumerate(entry.get('callbacks'), 1), lambda each: _callback(
             Entry(each[1], f'callback {each[0]} of {entry.name}', CALLBACK_KEYS), node, file,
             entries))

@@ -494,6 +494,8 @@ INCLUDE = {
 NODE_KEYS = {
     'node': Key(name(NODE), 'Fully qualified name of the node.', needed=True),
     'callbacks': Key(_entries('callback'), 'Its callbacks.', needed=True),
+    'concurrent': Key(_FLAG, 'Whether its callbacks may overlap with others of its program, even '
+                      'if the program spins in a single thread.'),
 }
 TRIGGERS = {
     'timer': Key(time(), 'A timer of this period starts it.'),

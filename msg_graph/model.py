@@ -299,6 +299,7 @@ class TaskSet:
     :ivar file: name of the declaration's file.
     :ivar text: the text of the declaration, resolved if it includes other files.
     :ivar processes: the declared processes, which contain each declared node once; may be empty.
+    :ivar concurrent: the nodes whose callbacks may overlap whatever executor their program has.
     :ivar vertices: the vertices of all DAGs, DAG by DAG.
     """
 
@@ -310,6 +311,7 @@ class TaskSet:
     file: str
     text: str
     processes: tuple[Process, ...] = ()
+    concurrent: tuple[str, ...] = ()
     vertices: tuple[Vertex, ...] = field(init=False, repr=False, compare=False)
     _vertex: dict[str, Vertex] = field(init=False, repr=False, compare=False)
     _dag: dict[str, Dag] = field(init=False, repr=False, compare=False)

@@ -81,6 +81,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--duration', type=options.duration, metavar='TIME',
         help='end after this time, for instance 20s, with --synthetic after a warm-up of 1 s '
         '(default: run until Ctrl-C)')
+    add('--concurrent', metavar='NAME', action='append', default=[],
+        help='let the callbacks of this node overlap with others of its program, even if the '
+        'program spins in a single thread; repeat it for more nodes')
     options.add(parser, '--policy', '--workers', '--fail-on-miss')
     options.add(parser, '--on-late', default='demote')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
@@ -224,7 +227,9 @@ def run_here(
         if args.synthetic is None:
             from mddag_executor.hosting.host import Host
             from mddag_executor.hosting.loading import ros_arguments
-            host = stack.enter_context(Host(signals))
+            host = stack.enter_context(Host(
+                signals, [*task_set.concurrent, *(
+                    f'/{name.lstrip("/")}' for name in args.concurrent)]))
             programs = host.load(args.node, ros_arguments(args.ros_args))
         from mddag_executor.executor.executor import MultiDeadlineExecutor
         executor = MultiDeadlineExecutor(
@@ -345,6 +350,7 @@ def _result(
     result: dict[str, Any] = {
         'file': task_set.file or None, 'nodes': args.node, 'synthetic': args.synthetic, **counts,
         'measured': None if ledger is None or plan is None else measure(ledger, plan)}
+    result['exclusion'] = []
     result['drift'] = [each.result() for each in watch.drift(counts)]
     if not session.clean:
         warn('a callback has not ended in time; it is abandoned')
@@ -445,4 +451,5 @@ def _run_programs(
     # what went wrong says more than that it was interrupted
     errors.sort(key=lambda error: isinstance(error, KeyboardInterrupt))
     result = _result(args, task_set, session, watch)
+    result['exclusion'] = host.exclusion()
     return result, _with_place(session.error or next(iter(errors), None), result, host.guests)

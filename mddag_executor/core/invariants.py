@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mddag_executor.core.queues import first_of
+from mddag_executor.core.queues import first_of, has_place
 from mddag_executor.core.state import (
     ALONE,
     FREE,
@@ -18,6 +18,8 @@ from mddag_executor.core.state import (
     N_HOLDING,
     N_IDLE,
     OPEN,
+    OUTER,
+    PLACED,
     QueueEntry,
     READY,
     RUNNING,
@@ -37,6 +39,7 @@ def broken_invariants(t: Tables, s: State) -> Iterator[str]:
     yield from _queues(t, s)
     yield from _workers(s)
     yield from _groups(t, s)
+    yield from _outer_groups(s)
     yield from _slots(t, s)
     yield from _open_jobs(t, s)
 
@@ -47,6 +50,8 @@ def _all_heaps(s: State) -> Iterator[tuple[str, int, list[QueueEntry]]]:
     yield 'what waits for a poll', UNPOLLED, s.unpolled
     for group, heap in enumerate(s.group_heap):
         yield f'the heap of group {group}', group, heap
+    for outer, heap in enumerate(s.outer_heap):
+        yield f'the heap of outer group {outer}', OUTER - outer, heap
 
 
 def _heaps(s: State) -> Iterator[str]:
@@ -122,7 +127,8 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
         if owner >= 0 and (s.x_group[owner] != group or s.x_state[owner] not in ACTIVE):
             yield (f'group {group} is owned by execution {owner}, which has group '
                    f'{s.x_group[owner]} and state {s.x_state[owner]}')
-    coming = {s.x_group[first_of(s, entry)] for entry in (*s.ready, *s.held_back)}
+    coming = {s.x_group[first_of(s, entry)] for entry in (
+        *s.ready, *s.held_back, *(entry for heap in s.outer_heap for entry in heap))}
     for group, heap in enumerate(s.group_heap):
         waiting = [first_of(s, entry) for entry in heap]
         if waiting and s.group_owner[group] < 0 and group not in coming:
@@ -130,6 +136,25 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
         for x in waiting:
             if s.x_group[x] != group:
                 yield f'execution {x} of group {s.x_group[x]} waits for group {group}'
+
+
+def _outer_groups(s: State) -> Iterator[str]:
+    coming = {s.x_outer[first_of(s, entry)] for entry in (*s.ready, *s.held_back)}
+    for outer, heap in enumerate(s.outer_heap):
+        placed = [x for x, place in enumerate(s.x_place)
+                  if place == PLACED and s.x_outer[x] == outer]
+        if len(placed) != s.outer_running[outer]:
+            yield (f'executions {placed} have places of outer group {outer}, counted are '
+                   f'{s.outer_running[outer]}')
+        waiting = [first_of(s, entry) for entry in heap]
+        if waiting and outer not in coming and has_place(s, waiting[0]):
+            yield f'outer group {outer} has places, and nothing brings {waiting} forward'
+        for x in waiting:
+            if s.x_outer[x] != outer:
+                yield f'execution {x} of outer group {s.x_outer[x]} waits for {outer}'
+        for x in placed:
+            if s.x_state[x] not in (RUNNING, ALONE):
+                yield f'execution {x} has a place and state {s.x_state[x]}'
 
 
 def _slots(t: Tables, s: State) -> Iterator[str]:

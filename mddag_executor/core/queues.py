@@ -21,6 +21,7 @@ Each entry is in exactly one of
 
 * the ready heap (``State.ready``), by the keys of the policy;
 * the heap of a callback group (``State.group_heap``), if the group was busy when it came first;
+* the heap of an outer group (``State.outer_heap``), if that had no place when it came first;
 * the heap of what is deferred (``State.held_back``), if an execution as urgent held the
 interpreter when it came first, or no worker of its process was idle;
 * under a policy that polls, the list of what waits for a poll (``State.unpolled``).
@@ -37,15 +38,19 @@ and executions are an entity each.
 
 from __future__ import annotations
 
-from heapq import heapify, heappush
+from heapq import heapify, heappop, heappush
 
 from mddag_executor.core.state import (
     ALONE,
     HELD_BACK,
     N_HOLDING,
+    NO_PLACE,
+    OUTER,
+    PLACED,
     POLLING,
     QueueEntry,
     READY,
+    RETURNS,
     State,
     UNPOLLED,
     WAITING,
@@ -118,18 +123,20 @@ def put(s: State, entry: QueueEntry) -> None:
 def unlink(s: State, x: int) -> None:
     """Take a waiting execution out of its queue, or away with its entry."""
     if s.x_state[x] == ALONE:
-        _remove(s.ready, ~x)
-        _remove(s.held_back, ~x)
-        _remove(s.unpolled, ~x)
+        remove(s.ready, ~x)
+        remove(s.held_back, ~x)
+        remove(s.unpolled, ~x)
         if s.x_group[x] >= 0:
-            _remove(s.group_heap[s.x_group[x]], ~x)
+            remove(s.group_heap[s.x_group[x]], ~x)
+        if s.x_outer[x] >= 0:
+            remove(s.outer_heap[s.x_outer[x]], ~x)
         return
     queue = s.x_queue[x]
     is_first = s.queue_first[queue] == x
     _link(s, queue, s.x_previous[x], s.x_next[x])
     s.x_next[x] = s.x_previous[x] = -1
     if s.queue_first[queue] < 0:
-        _remove(heap_at(s, s.queue_place[queue]), queue)
+        remove(heap_at(s, s.queue_place[queue]), queue)
         s.queue_place[queue] = READY
         s.queue_demoted[queue] = -1
     elif is_first and s.queue_place[queue] != READY and s.queue_place[queue] != UNPOLLED:
@@ -141,6 +148,8 @@ def heap_at(s: State, place: int) -> list[QueueEntry]:
     """Return the heap, or the list of what waits for a poll, at a place."""
     if place >= 0:
         return s.group_heap[place]
+    if place <= OUTER:
+        return s.outer_heap[OUTER - place]
     if place == HELD_BACK:
         return s.held_back
     return s.unpolled if place == UNPOLLED else s.ready
@@ -154,7 +163,7 @@ def change_key(s: State, queue: int, entry: QueueEntry) -> None:
         heap[_place_of(heap, queue)] = entry
         heapify(heap)
     else:
-        _remove(heap, queue)
+        remove(heap, queue)
         come_forward(s, entry)
 
 
@@ -163,6 +172,68 @@ def come_forward(s: State, entry: QueueEntry) -> None:
     if entry[4] >= 0:
         s.queue_place[entry[4]] = READY
     heappush(s.ready, entry)
+
+
+def has_place(s: State, x: int) -> bool:
+    """Return whether an execution may run as far as its outer group is concerned (rule 4)."""
+    outer = s.x_outer[x]
+    if outer < 0 or s.x_place[x] == PLACED:
+        return True
+    limit = s.outer_limit[outer]
+    if limit < 1 and s.x_place[x] == RETURNS:
+        limit = 1  # one that has begun goes on, also if its group is closed
+    return s.outer_running[outer] < limit
+
+
+def wait_for_outer(s: State, entry: QueueEntry, outer: int) -> None:
+    """Set an entry aside until its outer group has a place (rule 4)."""
+    if entry[4] >= 0:
+        s.queue_place[entry[4]] = OUTER - outer
+    heappush(s.outer_heap[outer], entry)
+
+
+def call_next(s: State, outer: int) -> None:
+    """Bring what waits first for a free place of an outer group forward."""
+    heap = s.outer_heap[outer]
+    if len(heap) == 0:
+        return
+    if has_place(s, first_of(s, heap[0])):
+        come_forward(s, heappop(heap))
+    elif s.outer_limit[outer] < 1 and s.outer_running[outer] == 0:
+        _call_returning(s, heap)
+
+
+def _call_returning(s: State, heap: list[QueueEntry]) -> None:
+    """Bring those forward that go on although their outer group is closed."""
+    kept = 0
+    for i in range(len(heap)):
+        entry = heap[i]
+        if s.x_place[first_of(s, entry)] == RETURNS:
+            come_forward(s, entry)
+        else:
+            heap[kept] = entry
+            kept += 1
+    del heap[kept:]
+    heapify(heap)
+
+
+def leave_outer(s: State, x: int) -> None:
+    """Give up the place of an execution in its outer group (rule 4)."""
+    s.x_place[x] = NO_PLACE
+    outer = s.x_outer[x]
+    s.outer_running[outer] -= 1
+    call_next(s, outer)
+
+
+def open_outer(s: State, outer: int, limit: int, once: int) -> None:
+    """
+    Set how many executions of an outer group may run at a time (rule 4).
+
+    :param once: 1: the group closes when the next one starts.
+    """
+    s.outer_limit[outer] = limit
+    s.outer_once[outer] = once
+    call_next(s, outer)
 
 
 def first_of(s: State, entry: QueueEntry) -> int:
@@ -178,14 +249,15 @@ def _place_of(heap: list[QueueEntry], what: int) -> int:
     return -1
 
 
-def _remove(heap: list[QueueEntry], what: int) -> None:
-    """Remove the entry of a queue, or ``~x``, from a heap if it is there."""
+def remove(heap: list[QueueEntry], what: int) -> bool:
+    """Remove the entry of a queue, or ``~x``, from a heap; return whether it was there."""
     place = _place_of(heap, what)
     if place >= 0:
         last = heap.pop()
         if place < len(heap):
             heap[place] = last
             heapify(heap)
+    return place >= 0
 
 
 def next_heap(t: Tables, s: State, first: bool) -> list[QueueEntry]:

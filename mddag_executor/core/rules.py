@@ -32,6 +32,11 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     smallest returns.  A user-defined group lets executions run one by one: if the owner may begin,
     it leaves the group for good (``leave_group``); if not, it waits as the owner, so that no other
     one overtakes it (``refuse``, then ``ask_again``).
+    Groups may belong to an *outer group* (live: the callbacks of a program's executor), of which
+    so many may run at a time, or none while it is closed (``open_outer``).  What comes first while
+    its outer group has no place is set aside in that group's heap.  An execution has a place while
+    it runs, but not while it is suspended, nor, if only one may run, while it has lent its worker:
+    it asks for one again, also of a closed group.
 5.  **Workers.**  A fresh execution goes to the idle worker with the lowest number (``schedule``),
     or to the worker that asks (``take``: live, cache-warm).  If no worker is idle and preemption
     is on, the running execution with the largest priority (ties: the highest worker number) is put
@@ -134,15 +139,19 @@ from mddag_executor.core.overload import (
 )
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
+    call_next,
     come_forward,
     enqueue,
+    has_place,
     idle_worker,
+    leave_outer,
     may_start,
     next_heap,
     poll,
     put,
     unlink,
     wait_alone,
+    wait_for_outer,
     wait_for_poll,
 )
 from mddag_executor.core.state import (
@@ -160,14 +169,17 @@ from mddag_executor.core.state import (
     LEADS_OUT,
     N_HOLDING,
     N_IDLE,
+    NO_PLACE,
     OPEN,
     ORDER,
     OUTDATED,
+    PLACED,
     POLLING,
     PREEMPTIVE,
     PROPAGATE,
     QueueEntry,
     READY,
+    RETURNS,
     RUNNING,
     SINK_IN_TIME,
     SINK_LATE,
@@ -286,6 +298,8 @@ def drop(t: Tables, s: State, x: int, now: int) -> None:
     group = s.x_group[x]
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
         _release_group(s, group)  # its entry may have been its group's in the ready heap
+    s.x_aside[x] = -1
+    _let_others(s, x)  # or that of its outer group
     if dag == len(s.free_slot):
         s.undeclared.append(x)
     else:
@@ -317,13 +331,26 @@ def peek(t: Tables, s: State, now: int) -> int:
                     _wait_for_group(s, entry, group)
                 else:
                     wait_for_poll(s, entry)
+                _let_others(s, x)
+            elif s.outer_limit and not has_place(s, x):
+                heappop(heap)
+                if s.x_aside[x] < 0 and s.outer_limit[s.x_outer[x]] > 0:
+                    s.x_aside[x] = now
+                if s.scalars[POLLING] == 0:
+                    wait_for_outer(s, entry, s.x_outer[x])
+                else:
+                    wait_for_poll(s, entry)
+                if group >= 0 and s.group_owner[group] == -1:
+                    _release_group(s, group)  # others of the group may be of another outer one
             elif (now > s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]
                     and demote(t, s, heap, x, now)):
                 if group >= 0 and s.group_owner[group] == -1:
                     _release_group(s, group)  # others of the group may go first
+                _let_others(s, x)
             elif ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
                     and not may_start(t, s, entry)):
                 _defer(s, heap, group)
+                _let_others(s, x)
             else:
                 return x
             heap = next_heap(t, s, False)
@@ -348,6 +375,25 @@ def _defer(s: State, heap: list[QueueEntry], group: int) -> None:
     heappush(s.held_back, entry)
     if group >= 0 and s.group_owner[group] == -1:
         _release_group(s, group)
+
+
+def _let_others(s: State, x: int) -> None:
+    """Let others have the place in its outer group that an execution cannot take yet."""
+    if s.x_outer[x] >= 0:
+        call_next(s, s.x_outer[x])
+
+
+def _enter_outer(s: State, x: int, outer: int, now: int) -> None:
+    """Give an execution that starts a place in its outer group."""
+    if s.x_aside[x] >= 0:
+        s.outer_wait[outer] += now - s.x_aside[x]
+        s.x_aside[x] = -1
+    if s.x_place[x] != PLACED:
+        s.x_place[x] = PLACED
+        s.outer_running[outer] += 1
+        if s.outer_once[outer] != 0:
+            s.outer_limit[outer] = s.outer_once[outer] = 0
+        call_next(s, outer)
 
 
 def take(t: Tables, s: State, worker: int, now: int) -> int:
@@ -385,6 +431,8 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     group = s.x_group[x]
     if group >= 0:
         s.group_owner[group] = x
+    if s.outer_limit and s.x_outer[x] >= 0:
+        _enter_outer(s, x, s.x_outer[x], now)
     return x
 
 
@@ -435,6 +483,8 @@ def lend(s: State, x: int) -> None:
         s.x_worker[x] = -1
         s.scalars[N_HOLDING] -= int(s.x_holds[x] != 0)
         s.scalars[N_IDLE] += 1
+    if s.x_place[x] == PLACED and s.outer_limit[s.x_outer[x]] <= 1:
+        leave_outer(s, x)
 
 
 def progress(s: State, x: int, now: int) -> int:
@@ -453,6 +503,8 @@ def suspend(s: State, x: int) -> None:
     """Suspend a running execution until ``resume``: it keeps its group, but no worker."""
     lend(s, x)
     s.x_state[x] = SUSPENDED
+    if s.x_place[x] == PLACED:
+        leave_outer(s, x)
 
 
 def refuse(s: State, x: int) -> None:
@@ -489,10 +541,23 @@ def resume(
     wait_alone(s, x)
 
 
+def rejoin(
+    t: Tables, s: State, key: KeyFunction, x: int, job: int, holds: int, now: int
+) -> None:
+    """Put an execution that has lent its worker back into the ready queue; see ``resume``."""
+    if s.x_outer[x] >= 0 and s.x_place[x] == NO_PLACE:
+        s.x_place[x] = RETURNS
+    resume(t, s, key, x, job, holds, now)
+
+
 def go_on_without(s: State, x: int) -> None:
     """Let a waiting execution that has run before go on without worker and interpreter."""
     unlink(s, x)
     s.x_state[x] = RUNNING
+    s.x_aside[x] = -1
+    if s.x_place[x] == RETURNS:
+        s.x_place[x] = PLACED
+        s.outer_running[s.x_outer[x]] += 1
 
 
 # --- completion ----------------------------------------------------------------------------------
@@ -511,6 +576,8 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         if s.x_holds[x] != 0:
             s.scalars[N_HOLDING] -= 1
     s.x_state[x] = DONE
+    if s.outer_limit and s.x_place[x] == PLACED:
+        leave_outer(s, x)
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == x:
         s.group_owner[group] = -1

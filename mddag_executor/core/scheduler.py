@@ -6,11 +6,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from heapq import heappush
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import policy
+from mddag_executor.core.queues import call_next, change_key, open_outer, remove
 from mddag_executor.core.state import (
     add_group,
+    add_outer_group,
     add_queue,
     add_slot,
     ALONE,
@@ -19,6 +22,7 @@ from mddag_executor.core.state import (
     empty,
     fill_state,
     OPEN,
+    OUTER,
     State,
     SUSPENDED,
     WAITING,
@@ -45,8 +49,8 @@ class Scheduler:
         did not complete its vertex.
     :ivar fail: ``fail(x, now)`` ends a failed execution; see ``complete``.
     :ivar answer: ``answer(slot, vertex, answered, now)`` completes a driven sync (rule 16).
-    :ivar resume: ``resume(x, job, holds, now)`` makes a suspended execution, or one that has lent
-        its worker, ready to go on.
+    :ivar resume: ``resume(x, job, holds, now)`` makes a suspended execution ready to go on.
+    :ivar rejoin: ``rejoin(x, job, holds, now)`` makes one that has lent its worker ready to go on.
 
     Functions without own logic here (``drop``, ``lend``, ``refuse``, …) are bound unchanged: see
     ``core.rules`` and ``core.jobs``.
@@ -82,6 +86,8 @@ class Scheduler:
             rules.resume, *rule, self.policy.key)
         self.answer: Callable[[int, int, int, int], None] = partial(
             rules.answer, *rule, self.policy.key)
+        self.rejoin: Callable[[int, int, int, int], None] = partial(
+            rules.rejoin, *rule, self.policy.key)
         self.finish: Callable[[int], None] = partial(jobs.finish, *rule)
 
     def release(self, dag: int, job: int, release: int, now: int) -> int:
@@ -130,6 +136,27 @@ class Scheduler:
     def free_group(self, group: int) -> None:
         """Free a group's number, for reuse after its executions have ended."""
         self._free_groups.append(group)
+
+    def new_outer_group(self) -> int:
+        """Add an outer group, which is closed, and return its number."""
+        return add_outer_group(self.state)
+
+    def open_outer(self, outer: int, limit: int, once: bool = False) -> None:
+        """Set how many executions of an outer group may run; see ``core.queues.open_outer``."""
+        open_outer(self.state, outer, limit, int(once))
+
+    def set_outer(self, x: int, outer: int) -> None:
+        """Move an execution that has no place in its outer group to another outer group."""
+        state = self.state
+        before, queue = state.x_outer[x], state.x_queue[x]
+        if before >= 0 and state.x_state[x] == ALONE:
+            if remove(state.outer_heap[before], ~x):
+                heappush(state.ready, state.x_key[x])
+        elif before >= 0 and state.x_state[x] == WAITING and state.queue_place[queue] <= OUTER:
+            change_key(state, queue, state.queue_key[queue])
+        state.x_outer[x] = outer
+        if before >= 0:
+            call_next(state, before)
 
     def new_queue(self) -> int:
         """Add a queue of an undeclared callback and return its number."""

@@ -20,6 +20,9 @@ from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 # suspended, too.
 IDLE, WAITING, ALONE, RUNNING, SUSPENDED, DONE, DROPPED = range(7)
 
+# Of an execution: whether it has a place in its outer group, or goes on after it has lent that.
+NO_PLACE, PLACED, RETURNS = range(3)
+
 # States of a job.  Every ended job is in exactly one of the last six; only recordings of version 2
 # and before have aborted ones.
 FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
@@ -33,6 +36,7 @@ ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # Where the entry of a queue is (``queue_place``), if not in the heap of a callback group.
 READY, HELD_BACK, UNPOLLED = -1, -2, -3
+OUTER = -4  # the first outer group, the next one is -5, …
 
 # Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
 # them, or deadlines of DAGs.
@@ -69,6 +73,13 @@ class State(NamedTuple):
     held_back: list[QueueEntry]
     group_heap: list[list[QueueEntry]]
     group_owner: list[int]
+    # by outer group: a heap of what waits for a place in it, how many may run at a time, how many
+    # do, whether it closes when the next one starts, and how long others have waited for it
+    outer_heap: list[list[QueueEntry]]
+    outer_limit: list[int]
+    outer_running: list[int]
+    outer_once: list[int]
+    outer_wait: list[int]
     # under a policy that polls: what waits for a poll, and by entity its first order, in a poll
     unpolled: list[QueueEntry]
     first_order: list[int]
@@ -128,6 +139,11 @@ class State(NamedTuple):
     x_state: list[int]
     x_pending: list[int]
     x_group: list[int]
+    # its outer group, or -1; whether it has a place in it (``PLACED``), or goes on (``RETURNS``);
+    # since when it waits for one, or -1
+    x_outer: list[int]
+    x_place: list[int]
+    x_aside: list[int]
     # the queue of its callback, or -1; in it, the next and the previous execution, or -1
     x_queue: list[int]
     x_next: list[int]
@@ -251,6 +267,9 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_slot.append(slot)
             s.x_vertex.append(vertex)
             s.x_group.append(t.group[vertex])
+            s.x_outer.append(-1)
+            s.x_place.append(0)
+            s.x_aside.append(-1)
             s.x_queue.append(t.first_leg[vertex] + leg)
             s.x_next.append(-1)
             s.x_previous.append(-1)
@@ -289,6 +308,16 @@ def add_group(s: State) -> int:
     s.group_owner.append(-1)
     add_heap(s.group_heap)
     return len(s.group_owner) - 1
+
+
+def add_outer_group(s: State) -> int:
+    """Add an outer group, which is closed, and return its number."""
+    add_heap(s.outer_heap)
+    s.outer_limit.append(0)
+    s.outer_running.append(0)
+    s.outer_once.append(0)
+    s.outer_wait.append(0)
+    return len(s.outer_limit) - 1
 
 
 def add_queue(s: State) -> int:

@@ -99,7 +99,8 @@ class ClientSource(Source):
         header, response = taken
         compat.complete_request(
             self.entity.rclpy, header.request_id.sequence_number, response,
-            self._at_once.pool.executor)
+            self._at_once.pool.outer_groups.get(self.entity.outer)
+            or self._at_once.pool.executor)
         self._at_once.has_run = True
 
 

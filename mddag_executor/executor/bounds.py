@@ -62,6 +62,13 @@ So a coroutine that yields a few times loses nothing, and one that polls does no
 time.
 """
 
+ALONE_NS = 5_000_000_000
+"""
+How long it waits at most for another callback of its program, which is not to overlap with it.
+
+If that one waits for it in turn (it may own a lock), the two overlap after this time.
+"""
+
 REJOIN_NS = 100_000_000
 """
 How long a callback waits for its worker after ``Client.call`` before it checks what keeps it.

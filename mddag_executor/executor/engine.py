@@ -44,7 +44,12 @@ from mddag_executor.core.estimates import note_time
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import due_of_answer, is_judged, judge_from
 from mddag_executor.core.overload import admit, is_late
-from mddag_executor.core.queues import first_of, overtaking_pays, overtaking_pays_from
+from mddag_executor.core.queues import (
+    first_of,
+    has_place,
+    overtaking_pays,
+    overtaking_pays_from,
+)
 from mddag_executor.core.state import (
     ALONE,
     ELSEWHERE,
@@ -256,6 +261,8 @@ class Engine:
             self._core()
         elif not self._is_bypassed:
             self._is_bypassed = self._may_bypass and self._is_core_empty()
+        if self._is_bypassed and entity.outer >= 0 and not self._is_outer_open(entity.outer):
+            self._core()
         if self._is_bypassed:
             x = work.x = self._last_id = self._last_id - 1
             waiting[x] = None
@@ -286,6 +293,7 @@ class Engine:
         entity.last_since = since
         x = work.x = self.scheduler.ready_undeclared(
             entity.ready, entity.group, entity.habit.holds, entity.queue, since)
+        self._state.x_outer[x] = entity.outer
         entity.waiting[x] = None
         self._work[x] = work
 
@@ -405,6 +413,7 @@ class Engine:
     def _start(self, work: Work, x: int, now: int) -> None:
         entity, state = work.entity, self._state
         state.x_group[x] = entity.group
+        state.x_outer[x] = entity.outer
         state.x_holds[x] = entity.habit.holds
         self._core().ready(x, now)
         work.x = x
@@ -582,11 +591,14 @@ class Engine:
         if state.unpolled or len(ready) > MOST or held_back and not is_held:
             return True
         x_holds, x_group, owners = state.x_holds, state.x_group, state.group_owner
+        has_outer = bool(state.outer_limit)
         first = held_back[0] if held_back else None
         for entry in ready:
             x = first_of(state, entry)
             group = x_group[x]
             if group >= 0 and owners[group] >= 0 and owners[group] != x:
+                continue
+            if has_outer and not has_place(state, x):
                 continue
             if not is_held or not x_holds[x]:
                 return True
@@ -646,10 +658,15 @@ class Engine:
         entity = work.entity
         self._core().resume(work.x, entity.ready, entity.habit.holds, now)
 
+    def waits_for_place(self, work: Work) -> bool:
+        """Return whether an execution that is to go on waits for others of its outer group."""
+        return not has_place(self._state, work.x)
+
     def rejoin(self, work: Work, now: int) -> None:
         """Make an execution that has lent its worker ready to go on: ``dispatch`` returns it."""
+        entity = work.entity
         self._work[work.x] = work
-        self._resume(work, now)
+        self._core().rejoin(work.x, entity.ready, entity.habit.holds, now)
 
     def go_on_without(self, work: Work) -> None:
         """Let an execution go on that waits for a worker after ``rejoin``, without one."""
@@ -672,6 +689,42 @@ class Engine:
             x = next(iter(entity.waiting), -1)
             if x >= 0 and self._state.x_state[x] == SUSPENDED:
                 self.scheduler.ask_again(x)
+
+    # --- outer groups --- ------------------------------------------------------------------------
+
+    def new_outer_group(self) -> int:
+        """Add an outer group of callbacks (see ``core.rules``, rule 4); it is closed."""
+        return self.scheduler.new_outer_group()
+
+    def open_outer(self, outer: int, limit: int, once: bool = False) -> bool:
+        """
+        Set how many executions of an outer group may run at a time.
+
+        :param once: it closes when the next one starts.
+        :return: whether one may start now.
+        """
+        core, state = self._core(), self._state
+        core.open_outer(outer, limit, once)
+        return any(
+            state.x_outer[first_of(state, entry)] == outer and has_place(
+                state, first_of(state, entry))
+            for queue in (state.ready, state.held_back) for entry in queue)
+
+    def outer_wait_ns(self, outer: int) -> int:
+        """Return how long executions have waited for others of their outer group."""
+        return self._state.outer_wait[outer]
+
+    def _is_outer_open(self, outer: int) -> bool:
+        state = self._state
+        return state.outer_limit[outer] > 0 and not state.outer_once[outer]
+
+    def move(self, entity: Entity, outer: int) -> None:
+        """Move an entity to another outer group, or to none (-1)."""
+        core = self._core()
+        entity.outer = outer
+        for work in self._work.values():
+            if work.entity is entity:
+                core.set_outer(work.x, outer)
 
     # --- ends of executions --- ------------------------------------------------------------------
 

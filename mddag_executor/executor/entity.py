@@ -38,8 +38,8 @@ class Entity:
     """
 
     __slots__ = (
-        'kind', 'rclpy', 'node', 'callback', 'group', 'depth', 'label', 'source', 'targets',
-        'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'lost',
+        'kind', 'rclpy', 'node', 'callback', 'group', 'outer', 'depth', 'label', 'source',
+        'targets', 'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'lost',
         'skipped', 'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
         'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
         'publishes', 'at_once', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
@@ -54,6 +54,8 @@ class Entity:
         self.node = node
         self.callback = callback
         self.group = group
+        # the number of its outer group in the core, or -1
+        self.outer = -1
         # its queue in the core, if it has run without a job; else -1
         self.queue = -1
         self.depth = depth

@@ -26,6 +26,7 @@ import select
 import threading
 import time
 from typing import Any, TYPE_CHECKING
+import weakref
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
@@ -48,6 +49,7 @@ from mddag_executor.executor.gil import short_switch_interval
 from mddag_executor.executor.loop import raise_limit
 from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.name_check import NameCheck
+from mddag_executor.executor.outer_groups import outer_here, OuterGroup
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.settings import Thresholds
@@ -325,14 +327,18 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
         """Run a function or coroutine in this executor; return its task, which is a future."""
+        return self.create_task_in(outer_here(), callback, *args, **kwargs)
+
+    def create_task_in(self, outer: int, callback: Any, *args: Any, **kwargs: Any) -> Task:
+        """Do the same for an outer group, given by its number; -1: none."""
         # A callback that ends a Client.call needs no worker: all workers may wait in such calls.
         if type(callback) is QuickCallback or is_quick(callback):
             task = Task(callback, args, kwargs)
             task()
             return task
         task, work = make_task(
-            self._task_entities.of(callback, args), self, self._pool.resume, self._unclaimed,
-            self._pool.loops, callback, args, kwargs)
+            self._task_entities.of(callback, args, outer), self, self._pool.resume,
+            self._unclaimed, self._pool.loops, callback, args, kwargs)
         is_spinning = self._spinning.locked()
         if is_spinning:
             self._pool.report(self._engine.ready, work)
@@ -350,14 +356,29 @@ class MultiDeadlineExecutor(BareExecutor):
 
     # --- interface for a host of programs --- ----------------------------------------------------
 
+    def new_outer_group(self) -> OuterGroup:
+        """Return a new outer group, which is closed: none of its callbacks starts."""
+        return OuterGroup(self._pool, weakref.WeakMethod(self.create_task_in))
+
+    def put(self, node: Node, group: OuterGroup | None) -> None:
+        """Let the callbacks of a node belong to an outer group; None: to none."""
+        groups = self._registry.outer_groups
+        number = -1 if group is None else group.number
+        if groups.get(node, -1) != number:
+            groups[node] = number
+            self._upkeep.change()
+            if self._pool.running:
+                self._upkeep.refresh()
+
     def on_callback_ended(
-        self, listener: Callable[[Any, BaseException | None], bool]
+        self, listener: Callable[[Any, BaseException | None, int], bool]
     ) -> None:
         """
-        Call a function after each callback, in its thread.
+        Call a function after each callback, and each piece of a coroutine, in its thread.
 
-        :param listener: receives rclpy's entity (None: a task), and the exception of its callback,
-            or None; returns whether it handles the exception, which then does not end ``spin``.
+        :param listener: receives rclpy's entity (None: a task), the exception of its callback, or
+            None, and the number of its outer group, or -1; returns whether it handles the
+            exception, which then does not end ``spin``.
         """
         self._pool.callback_ended = listener
 

@@ -88,6 +88,8 @@ class Registry:
         # all that are not freed yet
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._numbers: set[int] = set()
+        #: the core's outer groups of nodes
+        self.outer_groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._counting = threading.Lock()
         self.by_id: dict[int, Entity] = {}
         # the executor's own subscriptions
@@ -110,20 +112,23 @@ class Registry:
     def refresh(self, found: EntitySet) -> tuple[list[Entity], list[Entity]]:
         """Update the entities to those that the nodes have now; return new and removed ones."""
         present: dict[int, Entity] = {}
-        new: list[tuple[str, Any, str]] = []
+        new: list[tuple[str, Any, str, int]] = []
         for node, lists in found.items():
             try:
                 name = self._name(node)
             except InvalidHandle:
                 continue  # destroyed after it was listed
+            outer = self.outer_groups.get(node, -1)
             for kind, some in zip(LISTS.values(), lists):
                 for rclpy_entity in some:
                     key = id(rclpy_entity)
                     entity = self.by_id.get(key)
                     if entity is None or entity.rclpy is not rclpy_entity:
-                        new.append((kind, rclpy_entity, name))
+                        new.append((kind, rclpy_entity, name, outer))
                     else:
                         present[key] = entity
+                        if entity.outer != outer:
+                            self._engine.move(entity, outer)
         gone = [each for key, each in self.by_id.items() if key not in present]
         for each in gone:  # first: a new one may be their callback's next entity
             self._unbind(each)
@@ -223,7 +228,9 @@ class Registry:
         """Return the current timers."""
         return [entity for entity in self.by_id.values() if entity.kind == TIMER]
 
-    def _new_entity(self, kind: str, rclpy_entity: Any, node: str) -> Entity | None:
+    def _new_entity(
+        self, kind: str, rclpy_entity: Any, node: str, outer: int
+    ) -> Entity | None:
         callback, topic, depth, label, period = None, '', 0, '', None
         try:
             if kind == TIMER:
@@ -246,6 +253,7 @@ class Registry:
         decides = group is not None and decides_itself(group)
         number = self._number(rclpy_entity if decides else group)
         entity = Entity(kind, rclpy_entity, node, callback, number, depth, label)
+        entity.outer = outer
         if decides:
             entity.gate = partial(step_in_group, group, rclpy_entity, self._passed)
         elif group is not None and number >= 0 and group.has_entity(rclpy_entity):

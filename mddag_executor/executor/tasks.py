@@ -184,16 +184,23 @@ class TaskEntities:
         self.others = Entity(TASK, None, '', None, -1, 0, '')
         self._entities: dict[object, Entity] = {}
 
-    def of(self, callback: Any, args: tuple[Any, ...]) -> Entity:
-        """Return the record of a task's function; an action's goals have that of its callback."""
-        function = function_of_task(callback, args)
-        found = self._entities.get(function)
-        if found is None:
-            if len(self._entities) >= REMEMBERED:
+    def of(self, callback: Any, args: tuple[Any, ...], outer: int = -1) -> Entity:
+        """
+        Return the record of a task's function; an action's goals have that of its callback.
+
+        :param outer: its outer group in the core, or -1.
+        """
+        key = outer, function_of_task(callback, args)
+        if key not in self._entities and len(self._entities) >= REMEMBERED:
+            if outer < 0:
                 return self.others
+            key = outer, None
+        found = self._entities.get(key)
+        if found is None:
             found = Entity(TASK, None, '', None, -1, 0, '')
+            found.outer = outer
             found.address = self.others.address
-            self._entities[function] = found
+            self._entities[key] = found
         return found
 
 

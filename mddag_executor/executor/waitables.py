@@ -45,7 +45,7 @@ SENDER_CHECKS = 500
 Result = TypeVar('Result')
 
 
-def executions_of(entity: Entity, executor: Any) -> list[Work]:
+def executions_of(entity: Entity, pool: WorkerPool) -> list[Work]:
     """
     Take the ready data of a waitable; return the executions that handle them.
 
@@ -54,7 +54,7 @@ def executions_of(entity: Entity, executor: Any) -> list[Work]:
     """
     waitable = entity.rclpy
     data = waitable.take_data()
-    compat.attach_futures(waitable, executor)
+    compat.attach_futures(waitable, pool.outer_groups.get(entity.outer) or pool.executor)
     found = [Work(entity, callback, (message,))
              for callback, message in compat.feedback_taken(waitable, data, MOST)]
     if data or not found:
@@ -129,7 +129,7 @@ class WaitableSource(ChannelSource):
         found: list[Work] = []
 
         def take(waitable: Waitable) -> None:
-            found.extend(executions_of(self._by_id[id(waitable)], self._pool.executor))
+            found.extend(executions_of(self._by_id[id(waitable)], self._pool))
 
         for _ in range(MOST):
             before = len(found)
@@ -329,7 +329,7 @@ class WaitSetThread:
         found: list[Work] = []
 
         def take(waitable: Waitable) -> None:
-            found.extend(executions_of(by_id[id(waitable)], self._pool.executor))
+            found.extend(executions_of(by_id[id(waitable)], self._pool))
 
         for guard in waiting.wait(timeout_ns, take):
             entity = by_id.get(id(guard))

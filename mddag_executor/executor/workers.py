@@ -55,6 +55,7 @@ from mddag_executor.core.tables import NEVER
 from mddag_executor.errors import from_user_code
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
+    ALONE_NS,
     END_S,
     HISTORY,
     MOST,
@@ -186,8 +187,15 @@ class WorkerThread:
             self.published = monotonic_ns()
 
     def lend(self) -> Any:
-        """Lend the worker while entered: the callback waits for a service."""
-        return self.pool.lend(self)
+        """Lend the worker while entered: the callback waits for a service, or spins."""
+        work = self.work
+        group = None if work is None else self.pool.outer_groups.get(work.entity.outer)
+        return self.pool.lend(self) if group is None else self._lend_in(group)
+
+    @contextmanager
+    def _lend_in(self, group: Any) -> Iterator[None]:
+        with group.nested(), self.pool.lend(self):
+            yield
 
     @property
     def job(self) -> tuple[str, int, int] | None:
@@ -241,7 +249,9 @@ class WorkerPool:
         self._rejoining: dict[Work, WorkerThread] = {}
         self._n_ended = 0
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
-        self.callback_ended: Callable[[Any, BaseException | None], bool] | None = None
+        self.callback_ended: Callable[[Any, BaseException | None, int], bool] | None = None
+        #: by number: see ``MultiDeadlineExecutor.new_outer_group``
+        self.outer_groups: dict[int, Any] = {}
         self.context: Any = None
         #: called when entities have changed, or the context has ended
         self.wake_executor: Callable[[], None] = _nothing
@@ -666,6 +676,8 @@ class WorkerPool:
                         engine.ask_again()
                 else:
                     self._report_unusual_end(me, work, now)
+                if self._rejoining and not self.running:
+                    self._let_go_on()
                 if work.entity.removed:
                     self.wake_executor()  # the registry can forget it now
                 if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:
@@ -838,8 +850,8 @@ class WorkerPool:
             habit.rests -= 1  # an average of short executions stays short without it
         else:
             self._note_times(me, work, measurement, wall)
-        if self.callback_ended is not None and me.outcome is None:
-            self.callback_ended(entity.rclpy, None)
+        if self.callback_ended is not None and not isinstance(me.outcome, BaseException):
+            self.callback_ended(entity.rclpy, None, entity.outer)
 
     def _note_times(
         self, me: WorkerThread, work: Work, measurement: Measurement | None, wall: int
@@ -893,7 +905,8 @@ class WorkerPool:
         engine.ask_again()
 
     def _report_error(self, work: Work, error: BaseException) -> None:
-        if self.callback_ended is None or not self.callback_ended(work.entity.rclpy, error):
+        if self.callback_ended is None or not self.callback_ended(
+                work.entity.rclpy, error, work.entity.outer):
             self.fail(error)
 
     def _resume_after(self, work: Work, awaited: Any) -> None:
@@ -974,7 +987,10 @@ class WorkerPool:
         while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
             with self.lock:
                 before, seen = seen, (self._n_ended, process_time_ns())
-                if (work in self._rejoining and before[0] == seen[0]
+                if work in self._rejoining and engine.waits_for_place(work) and (
+                        self.now - now < ALONE_NS):
+                    self.tick()     # it is not to overlap with the one that has its place
+                elif (work in self._rejoining and before[0] == seen[0]
                         and seen[1] - before[1] < REJOIN_NS // 10):
                     self._go_on_without(work)
 
@@ -997,9 +1013,14 @@ class WorkerPool:
         thread.permit.release()
 
     def _let_go_on(self) -> None:
-        """Let all executions go on that wait for their workers; the caller holds the lock."""
+        """
+        Let the executions go on that wait for their workers; the caller holds the lock.
+
+        Of an outer group they go on one after the other.
+        """
         for work in list(self._rejoining):
-            self._go_on_without(work)
+            if not self.engine.waits_for_place(work):
+                self._go_on_without(work)
 
     # --- spin_once -------------------------------------------------------------------------------
 
@@ -1053,6 +1074,11 @@ class WorkerPool:
         """Return how many callbacks run, with or without those that wait for a service."""
         return sum(each.work is not None and (with_waiting or not each.waits)
                    for each in list(self._threads))
+
+    def n_running_of(self, outer: int) -> int:
+        """Return how many callbacks of an outer group run, also those that have lent workers."""
+        return sum(each.work is not None and each.work.entity.outer == outer
+                   for each in self._threads)
 
     def is_idle(self) -> bool:
         """Return whether no execution runs or is ready."""

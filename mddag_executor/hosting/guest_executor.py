@@ -7,6 +7,12 @@ The executor that a program makes gets a new class, derived from its former clas
 of ``GuestExecutor`` instead of rclpy's.  So it does not matter when a program imports rclpy's
 classes, and overridden methods stay.  ``node.executor`` is this executor even when the host's
 executor runs the node.
+
+What a program's own executor promises stays true.  All of its callbacks and tasks are an *outer
+group* of the core (``core.rules``, rule 4), which is open while the executor spins: for one
+callback at a time if its own executor has one thread, for n if it has n.  ``spin_once`` opens it
+until one callback has started.  The executor of ``rclpy.spin`` has only the nodes that are spun at
+the time, so there each node has a group.
 """
 
 from __future__ import annotations
@@ -15,20 +21,25 @@ from collections import deque
 from collections.abc import Callable
 from functools import cache
 import threading
+import time
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor.compat import is_called_by_spin
+from mddag_executor.executor.outer_groups import outer_here
 from mddag_executor.executor.tasks import watched
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor
+from rclpy.logging import get_logger
 from rclpy.node import Node
 
 if TYPE_CHECKING:
     from mddag_executor.hosting.host import Guest, Host
 
-_MOST_TURNS = 10
-"""At most this many callbacks, the usual queue depth, are remembered for ``spin_once``."""
 _STEP_S = 0.01
 """A step of unknown callbacks ends after this time."""
+_START_S = 0.1
+"""How long a callback that is ready may take to start in a ``spin_once`` that does not wait."""
+_POLL_S = 0.0005
+_UNBOUNDED = 1 << 30
 _MOST_ERRORS = 100
 """At most this many exceptions are kept for the next spin: the program does not handle them."""
 
@@ -41,6 +52,7 @@ class GuestExecutor:
     :ivar is_global: whether it is the executor of ``rclpy.spin``, which removes a node after each
         use.
     :ivar has_spun: whether its nodes run, also those that are added later.
+    :ivar is_pool: whether its callbacks are in no outer group.
     """
 
     host: Host
@@ -48,9 +60,10 @@ class GuestExecutor:
     is_global = False
     _changed: threading.Condition
     _errors: deque[BaseException]
-    has_spun = False
+    has_spun = is_pool = False
     _is_stopped = False
-    _turns = 0  # callbacks that have run since the last spin
+    # pieces of callbacks that have ended, and how many had at the end of the last spin
+    _n_ended = _n_seen = 0
     _n_stepping = _n_spinning = 0
 
     @property
@@ -61,10 +74,9 @@ class GuestExecutor:
     def spin(self) -> None:
         """Let the nodes run, and wait for the end."""
         self._wait(lambda: False, None)
-        self._turns = 0
 
     def spin_once(self, timeout_sec: Any = None) -> None:
-        """Let the nodes run, and wait until a callback has run since the last call."""
+        """Let the nodes run until a callback has run."""
         if timeout_sec is None and is_called_by_spin():
             self.spin()
         else:
@@ -74,7 +86,6 @@ class GuestExecutor:
         """Let the nodes run, and wait for a future."""
         with watched(future, self.wake_waiting):
             self._wait(_is_done(future), timeout_sec)
-        self._turns = 0
 
     def spin_once_until_future_complete(self, future: Any, timeout_sec: Any = None) -> None:
         """Do the same as ``spin_once``, or wait until a future is done."""
@@ -88,14 +99,23 @@ class GuestExecutor:
             raise ExternalShutdownException()
         with self._changed:
             self._n_stepping += 1
+        # callbacks that are in no group also run between two spins
+        groups = self._groups()
+        seen = self._n_ended if groups else self._n_seen
+
+        own = outer_here()
+
+        def has_ended() -> bool:  # a callback that runs in a spin of another one is none of ours
+            return self._n_ended > seen and all(
+                group.n_nested <= (group.number == own) for group in groups)
+
         try:
-            self._wait(lambda: self._turns > 0 or until(), timeout_sec)
+            self._wait(lambda: has_ended() or until(), timeout_sec, is_step=True)
         finally:
             with self._changed:
                 self._n_stepping -= 1
-                self._turns = max(0, self._turns - 1)
 
-    def _wait(self, until: Callable[[], bool], timeout_sec: Any) -> None:
+    def _wait(self, until: Callable[[], bool], timeout_sec: Any, is_step: bool = False) -> None:
         self.has_spun = True
         self._adopt(Executor.get_nodes(self))  # type: ignore[arg-type]
         raised: list[BaseException] = []
@@ -113,7 +133,12 @@ class GuestExecutor:
             timeout_s = min(timeout_s, threading.TIMEOUT_MAX)
         with self._changed:
             self._n_spinning += 1
+        # a callback that spins is in one of the groups: the host lets others of that run
+        groups = [group for group in self._groups() if group.number != outer_here()]
         try:
+            may_start = self._open(groups, is_step)
+            if may_start and timeout_s is not None and 0 <= timeout_s < _START_S:
+                timeout_s = _START_S
             self.host.wait(self._changed, is_over, timeout_s, self.guest)
         except KeyboardInterrupt as error:
             self.host.note_interrupt()
@@ -121,10 +146,40 @@ class GuestExecutor:
         finally:
             with self._changed:
                 self._n_spinning -= 1
+            if not self._n_spinning:
+                self._close(groups)
+            self._n_seen = self._n_ended
         if raised:
             if isinstance(raised[0], KeyboardInterrupt):
                 self._await_callbacks()
             raise raised[0]
+
+    def _groups(self) -> list[Any]:
+        """Return the outer groups that a spin opens."""
+        if self.is_pool:
+            return []
+        owners: list[Any] = [self]
+        if self.is_global:
+            owners = Executor.get_nodes(self)  # type: ignore[arg-type]
+        groups = [self.host.group_of(owner) for owner in owners]
+        return [group for group in groups if group is not None]
+
+    def _open(self, groups: list[Any], is_step: bool) -> bool:
+        """Let callbacks run; return whether one may start in a step that opens the groups."""
+        limit = _limit(self)
+        may_start = False
+        for group in groups:
+            self.host.note_group(group, self)
+            may_start |= group.open(limit, is_step and limit == 1)
+        return is_step and may_start
+
+    def _close(self, groups: list[Any]) -> None:
+        """Let no more callbacks run; in a single thread, the running one would end before."""
+        is_single = _limit(self) == 1
+        for group in groups:
+            group.open(0)
+            while is_single and group.n_running() and not self.host.is_over(self.guest):
+                time.sleep(_POLL_S)
 
     def _await_callbacks(self) -> None:
         """Wait until the callbacks that run have finished, if an interrupt ends the run."""
@@ -137,6 +192,8 @@ class GuestExecutor:
 
     def _adopt(self, nodes: list[Node]) -> None:
         for node in nodes:
+            owner = node if self.is_global else self
+            self.host.put(node, None if self.is_pool else self.host.group_of(owner))
             self.host.adopt(node, self.guest)
         if nodes and self.guest is not None:
             self.guest.is_complete = True
@@ -148,15 +205,13 @@ class GuestExecutor:
 
     def callback_ended(self, error: BaseException | None) -> bool:
         """Note that a callback has ended; return whether a spin raises its error."""
-        if error is None and self._turns >= _MOST_TURNS:
+        if error is None:
+            self._n_ended += 1
+            if self._n_stepping:
+                self.wake_waiting()
             return False
         guest = self.guest
         with self._changed:
-            if error is None:
-                self._turns += 1
-                if self._n_stepping:
-                    self._changed.notify_all()
-                return False
             if guest is None or guest.returned or self.host.is_over(guest) or (
                     len(self._errors) >= _MOST_ERRORS):
                 return False
@@ -182,7 +237,9 @@ class GuestExecutor:
             self.host.release(node, self.guest)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
-        """Create a task of the host's executor."""
+        """Create a task of the host's executor, in the group of this one."""
+        for group in self._groups()[:1]:
+            return group.create_task(callback, *args, **kwargs)
         return self.host.executor.create_task(callback, *args, **kwargs)
 
     def wake(self) -> None:
@@ -203,6 +260,17 @@ def _is_done(future: Any) -> Callable[[], bool]:
     return lambda: bool(future.done() or future.cancelled())
 
 
+def _limit(executor: Any) -> int:
+    """Return how many callbacks at a time a program's own executor would run."""
+    kind = type(executor).__mro__[1]  # without the methods of this module
+    if _is_replaced(kind, 'spin_once'):
+        if issubclass(kind, MultiThreadedExecutor):
+            return int(executor._executor._max_workers)
+        if kind.__module__.partition('.')[0] != 'mddag_executor':
+            return 1
+    return _UNBOUNDED  # its threads are its own
+
+
 def make_guest(executor: Any, host: Host, guest: Guest | None) -> None:
     """Make a ``GuestExecutor`` of an executor."""
     executor.__class__ = _guest_class(executor.__class__)
@@ -210,12 +278,33 @@ def make_guest(executor: Any, host: Host, guest: Guest | None) -> None:
     executor._changed, executor._errors = threading.Condition(), deque()
 
 
+def _is_replaced(kind: type[Executor], name: str) -> bool:
+    """Return whether a method is rclpy's or this package's, not the program's own."""
+    method = getattr(kind, name, None)
+    return method is None or method.__module__.partition('.')[0] in ('rclpy', 'mddag_executor')
+
+
+def _with_warning(kind: type[Executor]) -> Callable[..., None]:
+    """Return the ``spin_once`` of a program's own class, which says what it does."""
+    def spin_once(executor: Any, *args: Any, **more: Any) -> None:
+        if not executor.has_warned:
+            executor.has_warned = True
+            get_logger('mddag_executor').warning(
+                f'{kind.__module__}.{kind.__qualname__} has a spin_once of its own: callbacks '
+                'that it runs are neither ordered, recorded nor judged')
+        kind.spin_once(executor, *args, **more)
+
+    return spin_once
+
+
 @cache
 def _guest_class(kind: type[Executor]) -> type[Any]:
     """Derive a class with the methods of this module instead of those of rclpy."""
     methods = {
-        name: method for name, method in vars(GuestExecutor).items() if callable(method) and (
-            getattr(kind, name, method).__module__.partition('.')[0]
-            in ('rclpy', 'mddag_executor'))}
+        name: method for name, method in vars(GuestExecutor).items()
+        if callable(method) and _is_replaced(kind, name)}
     methods['is_spinning'] = GuestExecutor.is_spinning
+    methods['has_warned'] = False
+    if 'spin_once' not in methods:
+        methods['spin_once'] = _with_warning(kind)
     return type(kind.__name__, (kind, GuestExecutor), methods)

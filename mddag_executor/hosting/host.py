@@ -31,12 +31,13 @@ Theory of operation
    removed, unless it has returned them.  The run ends when the last main has returned.
    If a SIGINT ends the run, the spin of the program in the main thread raises KeyboardInterrupt
    when no callback runs any more, as do those in the threads of the other mains.
-4. An exception of a callback is raised by the spin of its program.  Nodes that a program has
+4. Callbacks of a program run only while it spins, and as many at a time as its own executor would
+   run: see ``guest_executor``.  Nodes that it has returned have no spin, and no such bound.
+5. An exception of a callback is raised by the spin of its program.  Nodes that a program has
    returned have no such spin: their exceptions end the run.
 
-Differences from a separate process: callbacks also run between two ``spin_once``; the arguments
-and the domain that a program passes to ``rclpy.init`` are ignored; ``sys.argv`` is right only
-until the next program starts.
+Differences from a separate process: the arguments and the domain that a program passes to
+``rclpy.init`` are ignored; ``sys.argv`` is right only until the next program starts.
 """
 
 from __future__ import annotations
@@ -120,11 +121,14 @@ class Host:
     Runs programs in the default context; a context manager.
 
     :param signals: tells what becomes of signals; None: they are nothing of the host's.
+    :param concurrent: the names of the nodes whose callbacks may overlap with each other, and with
+        what their program does between its spins, whatever executor they have.
     :ivar executor: runs the nodes of all programs; None before ``start``.
     """
 
-    def __init__(self, signals: Signals | None = None) -> None:
+    def __init__(self, signals: Signals | None = None, concurrent: Iterable[str] = ()) -> None:
         self.executor: Any = None
+        self.concurrent = {*concurrent}
         self.guests: list[Guest] = []
         self.global_executor: Any = None  # of callbacks: they belong to no program's thread
         self.end_run: Callable[[], None] = lambda: None
@@ -135,6 +139,10 @@ class Host:
         self._lock = threading.RLock()  # reentrant: a signal handler may interrupt its owner
         self._node_of: Any = weakref.WeakKeyDictionary()  # by entity
         self._executors: Any = weakref.WeakSet()
+        # outer groups by executor, or by node of a global one, and the executors by their number
+        self._groups: Any = weakref.WeakKeyDictionary()
+        self._executor_of_group: Any = weakref.WeakValueDictionary()
+        self._opened: dict[int, tuple[Any, str]] = {}
         self._of_callbacks: Any = weakref.WeakSet()  # threads
         # the node behind each object that a program has added as a node
         self._behind: Any = weakref.WeakKeyDictionary()
@@ -335,6 +343,8 @@ class Host:
                     self._global_executor().add_node(node)
                 executor: Any = node.executor
                 executor.has_spun = True    # callbacks may add more nodes to it
+                executor.is_pool = True     # no spin excludes anything
+                self.put(node, None)
                 self.adopt(node, guest)
         except SystemExit as error:
             if error.code not in (None, 0):
@@ -433,8 +443,42 @@ class Host:
             with suppress(ValueError):
                 guest.nodes.remove(node)
 
-    def _callback_ended(self, entity: Any, error: BaseException | None) -> bool:
+    def group_of(self, owner: Any) -> Any:
+        """Return the outer group of an executor's callbacks, or a node's; None: there are none."""
+        if not hasattr(self.executor, 'new_outer_group'):
+            return None
+        with self._lock:
+            group = self._groups.get(owner)
+            if group is None:
+                group = self._groups[owner] = self.executor.new_outer_group()
+        return group
+
+    def note_group(self, group: Any, executor: Any) -> None:
+        """Note whose spin has opened an outer group: it gets the ends of its callbacks."""
+        self._executor_of_group[group.number] = executor
+        if executor.guest is not None:
+            self._opened[group.number] = group, executor.guest.program.spec
+
+    def exclusion(self) -> list[dict[str, Any]]:
+        """Return how long callbacks of each program have waited for others of it."""
+        waited = {guest.program.spec: 0 for guest in self.guests}
+        for group, spec in self._opened.values():
+            waited[spec] += group.wait_ns()
+        return [{'program': spec, 'waited_ns': ns} for spec, ns in waited.items() if ns]
+
+    def put(self, node: Node, group: Any) -> None:
+        """Let the callbacks of a node belong to an outer group, unless they are concurrent."""
+        if hasattr(self.executor, 'put'):
+            is_concurrent = node.get_fully_qualified_name() in self.concurrent
+            self.executor.put(node, None if is_concurrent else group)
+
+    def _callback_ended(
+        self, entity: Any, error: BaseException | None, outer: int = -1
+    ) -> bool:
         """Note the end of a callback; return whether a spin of its program raises its error."""
+        executor = self._executor_of_group.get(outer)
+        if executor is not None:
+            return bool(executor.callback_ended(error))
         if entity is None:
             return False
         if entity not in self._node_of:

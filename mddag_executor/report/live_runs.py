@@ -20,6 +20,9 @@ from mddag_executor.report.tables import (
 from mddag_executor.report.text import listed, printable
 from mddag_executor.text import counted
 
+SHOWN_NS = 10_000_000
+"""Less waiting for other callbacks of the program is not worth a line."""
+
 
 def live_lines(result: dict[str, Any]) -> Iterator[str]:
     """Yield the table of a run's sinks (there is none without a declaration), and the lines."""
@@ -55,6 +58,11 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
         if numbers:
             yield f'{counted(sum(numbers.values()), one, many)}: ' + listed(
                 [f'{name} {n}' for name, n in numbers.items()])
+    for each in result.get('exclusion', ()):
+        if each['waited_ns'] >= SHOWN_NS:
+            yield (f'callbacks of --node {printable(each["program"])} waited '
+                   f'{each["waited_ns"] / 1e9:.2f} s in all, as its executor runs only so many '
+                   'at a time (--concurrent NODE lets them overlap)')
     deaf = {name: each['incompatible_qos'] for name, each in result['callbacks'].items()
             if each.get('incompatible_qos') and not each['ran']}
     if deaf:

@@ -47,9 +47,11 @@ class NodeHolder(BareExecutor):
         loop.call_in_run(lambda: loop.engine.ready(work, loop.now))
         return task
 
-    def on_callback_ended(self, listener: Callable[[Any, BaseException | None], bool]) -> None:
+    def on_callback_ended(
+        self, listener: Callable[[Any, BaseException | None, int], bool]
+    ) -> None:
         """Have a function called after each callback; what one raises ends the run."""
-        self._loop.on_ended = lambda entity: listener(entity, None)
+        self._loop.on_ended = lambda entity: listener(entity, None, -1)
 
 
 class RerunHost(Host):

@@ -36,7 +36,7 @@ def test_every_key(loader):
     golden.compare('everything', '\n'.join(map(repr, (
         tasks.workers, *tasks.callbacks, *dags, *tasks.queue_edges, *tasks.paths,
         *tasks.processes))) + '\n', GOLDEN)
-    assert str(tasks.callbacks[-1].tolerate) == '2 of 50'
+    assert str(tasks.callbacks[-1].tolerate) == '2 of 50' and tasks.concurrent == ('/sink',)
     words = EVERYTHING.replace('{', ' ').replace(',', ' ').split()
     keys = {*language.FILE, *language.NODE_KEYS, *language.CALLBACK_KEYS,
             *language.PATH_KEYS, *language.QUANTILES}

@@ -473,13 +473,6 @@ def refuses():
     rclpy.shutdown()
 
 
-def no_longer_spins():
-    try:
-        after_a_while(lambda: 1 / 0, 0.01)
-    except ZeroDivisionError:
-        time.sleep(60)
-
-
 def waits_for_a_task():
     rclpy.init()
     executor = SingleThreadedExecutor()
