@@ -8,7 +8,7 @@ Eleven ordinary nodes: each sink takes times of its own, to compare them with th
 The detector publishes an alarm only when it sees a person, and needs 150 ms for every second one,
 so that the brake is late.  A timer fires once, a button is pressed now and then, and the planner
 only stores what the IMU measures.  The fusion combines each scan of the lidar with the next boxes,
-which have another rate.
+which have another rate.  Two paths have requirements from end to end.
 """
 
 from __future__ import annotations
@@ -97,7 +97,10 @@ class Planner(Part):
         self.imu = message
 
     def plan(self, message: Header) -> None:
+        imu = self.imu
         self.done('plan', message)
+        if imu is not None:
+            self.done('imu', imu)   # how old it is
 
 
 class Fusion(Part):
@@ -165,6 +168,13 @@ def main() -> None:
                   f'{sum(t > deadline_ms for t in times)} late; judged {sink["completed"]} '
                   f'results, {sink["late"]} late, {sink.get("not_due", 0)} not due '
                   f'in {dag["jobs"]} jobs')
+    required = executor.statistics()['requirements']
+    age, ages = required['imu_to_plan']['age'], responses['/planner:imu']
+    print(f'imu_to_plan: itself {len(ages)} outputs, the oldest {max(ages):.0f} ms; judged '
+          f'{age["completed"]} outputs, the oldest {age["response_ns"]["max"] / 1e6:.0f} ms')
+    reaction = required['image_to_brake']['reaction']
+    print(f'image_to_brake: judged {reaction["completed"]} reactions, {reaction["not_due"]} not '
+          'due')
 
 
 if __name__ == '__main__':

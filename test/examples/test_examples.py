@@ -123,9 +123,14 @@ def test_robot():
 
 def test_ordinary_robot():
     """The verdicts are what the nodes' own time stamps say."""
+    *lines, age, reaction = run('ordinary_robot').splitlines()
+    outputs, oldest, judged, judged_oldest = map(int, re.findall(r'\d+', age))
+    # the nodes stamp a message a little after the callback began
+    assert 0 <= outputs - judged <= 1 and abs(judged_oldest - oldest) <= 60
+    assert all(int(n) >= 3 for n in re.findall(r'\d+', reaction))
     found = {m[1]: tuple(map(int, m.groups()[1:])) for m in map(re.compile(
         r'(\S+): itself (\d+) results, (\d+) late; judged (\d+) results, (\d+) late, '
-        r'(\d+) not due in (\d+) jobs').fullmatch, run('ordinary_robot').splitlines())}
+        r'(\d+) not due in (\d+) jobs').fullmatch, lines)}
     assert set(found) == {
         '/brake:stop', '/planner:plan', '/tracker:track', '/panel:lamp', '/panel:pressed'}
     own, own_late, completed, late, _, _ = found.pop('/tracker:track')
