@@ -101,12 +101,20 @@ class RequirementTally(SinkTally):
         if late and self._window is not None:
             self._window.add(self._results)
 
-    def result(self) -> dict[str, Any]:
-        """Return the requirement's part of the result, in the format of a sink."""
-        found = super().result()
+    def result_with(self, missed: int = 0) -> dict[str, Any]:
+        """
+        Return the requirement's part of the result, in the format of a sink.
+
+        :param missed: further results that are missed so far.
+        """
+        found = self.result()
+        found['late'] += missed
+        found['overdue'] += missed
         if self._tolerate is not None and self._window is not None:
-            found['tolerate'] = {'misses': self._tolerate.misses, 'of': self._tolerate.of,
-                                 'worst': self._window.worst}
+            found['tolerate'] = {
+                'misses': self._tolerate.misses, 'of': self._tolerate.of,
+                'worst': self._window.worst_with(
+                    range(self._results + 1, self._results + 1 + missed))}
         return found
 
 

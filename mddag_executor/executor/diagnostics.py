@@ -33,6 +33,7 @@ import time
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core import quantile
+from mddag_executor.core.requirements import Requirements
 from mddag_executor.core.tally import Counts, counts, Tally
 from mddag_executor.executor.bounds import END_S
 from mddag_executor.executor.quiet_nodes import quiet_node
@@ -128,8 +129,9 @@ class DagWatch:
         results, window = (Counts.total(each.values()) for each in (seen.results, windows))
         in_stops = seen.in_stops - before.in_stops
         silence = self._silence(now)
-        levels = {name: STALE if silence else self._level(
-            seen.results[name].minus(last.results[name]), windows[name]) for name in self._sinks}
+        levels = {name: STALE if silence else _level(
+            self._thresholds, seen.results[name].minus(last.results[name]), windows[name])
+            for name in self._sinks}
         ratio = window.missed / window.due if window.due else 0.0
         values = {
             'period_ms': _ms(self._dag.period_ns), 'jobs': str(seen.jobs),
@@ -169,17 +171,6 @@ class DagWatch:
         return (f'nothing has been released for {silent / 1e9:.1f} s'
                 if silent >= self._stale_after else '')
 
-    def _level(self, step: Counts, window: Counts) -> int:
-        """Return the level of a sink by its results of the last period and of the window."""
-        limits = self._thresholds
-        if not window.missed:
-            return OK
-        if window.missed >= max(limits.warn_burst, limits.error_ratio * window.due):
-            return ERROR
-        if step.missed >= limits.warn_burst or window.missed >= limits.warn_ratio * window.due:
-            return WARN
-        return OK
-
     def _new_responses(self, last: _Seen, seen: _Seen) -> dict[str, list[int]]:
         """Return the response times of the last period, by sink."""
         found = {}
@@ -217,6 +208,17 @@ class DagWatch:
             'wrong': silence or _wrong(window)}
 
 
+def _level(limits: Thresholds, step: Counts, window: Counts) -> int:
+    """Return the level of a sink by its results of the last period and of the window."""
+    if not window.missed:
+        return OK
+    if window.missed >= max(limits.warn_burst, limits.error_ratio * window.due):
+        return ERROR
+    if step.missed >= limits.warn_burst or window.missed >= limits.warn_ratio * window.due:
+        return WARN
+    return OK
+
+
 def _message(window: Counts, in_stops: int) -> str:
     if not window.missed:
         return f'{counted(window.due, "result")} in time'
@@ -235,6 +237,46 @@ def _wrong(window: Counts) -> str:
 
 def _ms(nanoseconds: int) -> str:
     return f'{nanoseconds / 1e6:.3f}'
+
+
+class RequirementWatch:
+    """Judges what is required of paths, period by period; response times are of the whole run."""
+
+    def __init__(self, thresholds: Thresholds) -> None:
+        self._thresholds = thresholds
+        self._seen: deque[dict[tuple[str, str], Counts]] = deque(
+            [{}], maxlen=thresholds.window + 1)
+
+    def statuses(self, requirements: Requirements) -> list[Status]:
+        """Return a status for each path; called once a period."""
+        now = {(path, what): counts(each) for path, every in requirements.items()
+               for what, each in every.items()}
+        nothing = Counts.total([])
+        last, before = self._seen[-1], self._seen[0]
+        self._seen.append(now)
+        found = []
+        for path, every in requirements.items():
+            windows = {what: now[path, what].minus(before.get((path, what), nothing))
+                       for what in every}
+            levels = {what: _level(
+                self._thresholds, now[path, what].minus(last.get((path, what), nothing)),
+                windows[what]) for what in every}
+            window = Counts.total(windows.values())
+            values = {'window_results': str(window.due), 'window_missed': str(window.missed),
+                      'window_missed_ratio': f'{window.missed / max(1, window.due):.4f}'}
+            for what, each in every.items():
+                response, due = each['response_ns'], windows[what].due
+                values.update({f'{key} {path}:{what}': value for key, value in {
+                    'level': LEVELS[levels[what]], 'window_results': str(due),
+                    'in_time_ratio': f'{windows[what].in_time / due:.4f}' if due else '',
+                    'deadline_ms': _ms(each['relative_deadline_ns']),
+                    **({'response_p99_ms': _ms(response['p99']), 'margin_ms': _ms(
+                        each['relative_deadline_ns'] - response['max'])} if response else {}),
+                    'wrong': _wrong(windows[what])}.items()})
+            found.append(Status(
+                f'{self._thresholds.name}: path {path}', max(levels.values()),
+                _message(window, 0), values))
+        return found
 
 
 class PoolWatch:
@@ -315,16 +357,22 @@ class Diagnostics:
             self._dags.append((
                 {vertex.callback.key for vertex in reported_by},
                 DagWatch(verdicts.tally, dag, thresholds, period_ns, verdicts.in_stops)))
+        self._workers = pool
+        self._requirements = RequirementWatch(thresholds)
         self._pool = PoolWatch(pool, registry, recorder, thresholds, notifier)
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 
     def statuses(self) -> list[Status]:
-        """Return a status for each DAG with a callback here, and the pool's."""
+        """Return a status for each DAG with a callback here, each path, and the pool's."""
         now = time.monotonic_ns()
         hosted = self._registry.hosted()
         found = [watch.status(now, hosted) for keys, watch in self._dags
                  if not keys.isdisjoint(hosted)]
+        if self._workers.engine.path_watch is not None:
+            with self._workers.lock:
+                requirements = self._workers.engine.requirements(self._workers.clock.now())
+            found += self._requirements.statuses(requirements)
         return [*found, self._pool.status(now)]
 
     def start(self) -> None:

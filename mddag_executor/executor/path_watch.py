@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from copy import deepcopy
 from typing import Any
 
 from mddag_executor.core.requirements import RequirementTally, Rules
@@ -178,17 +177,16 @@ class _Path:
             self._silent_since = end
 
     def result(self, now: int, judge_from: int) -> dict[str, Any]:
-        tallies = deepcopy(self._tallies)
-        for what, tally in tallies.items():
+        found = {}
+        for what, tally in self._tallies.items():
             required = tally.relative_deadline_ns
             if what == 'reaction':
                 missed = sum(since + required <= now for _, since in self._pending)
             else:
                 missed = 0 if self._silent_since is None else self._rules.missing_outputs(
                     self._silent_since, now, required)
-            for _ in range(missed):
-                tally.add_missed()
-        return {what: tally.result() for what, tally in tallies.items()}
+            found[what] = tally.result_with(missed)
+        return found
 
 
 def divided(task_set: TaskSet) -> Iterable[str]:

@@ -124,7 +124,7 @@ class Requirements:
             path = self._paths.paths[number]
             tally = RequirementTally(path, path.requirements[what])
             tally.add_all(table['kind'].tolist(), (table['end'] - table['since']).tolist())
-            found.setdefault(path.name, {})[what] = tally.result()
+            found.setdefault(path.name, {})[what] = tally.result_with()
         return found
 
     # --- where the time went ---------------------------------------------------------------------

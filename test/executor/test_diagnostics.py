@@ -5,21 +5,23 @@
 import itertools
 import os
 import time
-from types import NoneType, UnionType
+from types import NoneType, SimpleNamespace, UnionType
 from typing import get_args, get_origin, get_type_hints, is_typeddict, Union
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mddag_executor.core import Tables, Tally
+from mddag_executor.core.requirements import RequirementTally
 from mddag_executor.core.state import SINK_EXPIRED, SINK_IN_TIME, SINK_LATE
 from mddag_executor.errors import UsageError
-from mddag_executor.executor.diagnostics import DagWatch, ERROR, OK, STALE, WARN
+from mddag_executor.executor.diagnostics import DagWatch, ERROR, OK, RequirementWatch, STALE, WARN
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.statistics_types import Statistics
 from mddag_executor.executor.watch import Watch
 from mddag_executor.replay import open_recording
 from mddag_executor.replay.drift import drift_of
+from mddag_executor.report.board import Board
 from mddag_executor.report.live_runs import live_lines
-from msg_graph import loads
+from msg_graph import loads, Path
 import pytest
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -305,3 +307,24 @@ def test_a_subscription_that_gets_nothing_for_its_qos_is_named(make_executor, ma
     lines = list(live_lines({**executor.statistics(), 'measured': None}))
     assert ('1 callback without messages, as a publisher has an incompatible QoS: '
             '/detector:detect (RELIABILITY)') in lines
+
+
+def test_paths_are_shown_next_to_sinks():
+    watch, board = RequirementWatch(Thresholds()), Board()
+    path = Path('imu_to_wheels', ('/a:a', '/b:b'), reaction_ns=30_000_000)
+    tally = RequirementTally(path, 30_000_000)
+    levels = []
+    for late in (0, 0, 5):
+        for _ in range(10 - late):
+            tally.add(20_000_000)
+        status, = watch.statuses({path.name: {'reaction': tally.result_with(missed=late)}})
+        levels.append(status.level)
+    assert levels == [OK, OK, ERROR]
+    board.take(SimpleNamespace(status=[SimpleNamespace(
+        level=bytes([status.level]), name=status.name, message=status.message, hardware_id='h/1',
+        values=[SimpleNamespace(key=k, value=v) for k, v in status.values.items()])]))
+    sink, = board.result()['sinks']
+    assert (sink['dag'], sink['sink'], sink['level']) == (
+        'path imu_to_wheels', 'imu_to_wheels:reaction', 'ERROR')
+    assert (sink['in_time_ratio'], sink['deadline_ms']) == (pytest.approx(25 / 30, abs=1e-3), 30)
+    assert sink['wrong'] == '5 late'
