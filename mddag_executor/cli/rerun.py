@@ -104,6 +104,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
     from mddag_executor.rerun.run import Rerun
     from mddag_executor.trace.trace_file import whole_trace
     task_set = common.load_graph(args.graph)
+    common.leave_out_paths('rerun', task_set)
     path, name = common.input_path(args.recording)
     with ExitStack() as files:
         messages, times = open_input(path, task_set, args.execution_times, args.seed, name)
