@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tolerated misses, failed jobs and runs without a job, wherever verdicts are told."""
 
+import json
 from xml.etree import ElementTree
 
 from mddag_executor.core.tally import SinkTally
@@ -141,7 +142,8 @@ def test_where_nothing_was_due_nothing_is_proven(empty, graph, tmp_path, mode, c
     assert 'never due, so not judged: 1 sink: /n:a' in said
     assert 'No job was due at any sink: nothing is proven.' in page.read_text()
     assert 'no job was due' in failure_in(out)
-    assert call(*arguments, '--json', '-').result['never_due'] == ['/n:a']
+    done = call(*arguments, '--json', '-')
+    assert done.returncode == 2 and json.loads(done.stdout)['never_due'] == ['/n:a']
 
 
 def test_a_run_in_which_nothing_was_due_is_no_better(trace, empty, call):
