@@ -256,7 +256,7 @@ def test_a_listener_may_handle_exceptions_of_callbacks(make_executor, make_node)
     async def coroutine():
         pass
 
-    def note(entity, error):
+    def note(entity, error, outer):
         ended.append((entity, str(error)))
         return error is not None
 
