@@ -10,6 +10,7 @@ the process, when the first executor is made.
 
 1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
 2.  *A publication on a trigger topic* is noted, so that its messages find their job (``jobs``).
+    Those outside of callbacks are counted, because the middleware numbers them as well.
 3.  *Delivery within the process.*  A middleware that delivers within a process does so inside
     ``publish``: the message can be taken when that returns.  The publishing thread takes the
     message itself instead of waking a worker.  The descriptors of this process's subscriptions on
@@ -117,7 +118,7 @@ def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Pub
     if running is not None:
         running.publishes(state, msg)
         topic = running.engine.jobs.topics.get(state.topic)
-    if topic is None and not state.is_tracked:
+    if running is not None and topic is None and not state.is_tracked:
         original(publisher, msg)
         return None
     with state.lock:

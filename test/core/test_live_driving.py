@@ -199,7 +199,7 @@ class LiveDriver(RuleBasedStateMachine):
         run = self.by_x[x]
         assert run in able
         if not self.scheduler.policy.polling:  # what waits for the next poll may be smaller
-            # the queue that it has left is checked again when it comes first: that may be late, too
+            # the queue that it has left may be late as well: it is checked when it comes first
             others = [other for other in able if other is run or other not in self.queue(run)]
             assert self.key(run) <= min(map(self.key, others)), 'a smaller key waits'
         run.fate, run.began, run.owns = RUNNING, True, True
