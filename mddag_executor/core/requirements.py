@@ -101,13 +101,15 @@ class RequirementTally(SinkTally):
         if late and self._window is not None:
             self._window.add(self._results)
 
-    def result_with(self, missed: int = 0) -> dict[str, Any]:
+    def result_with(self, missed: int = 0, not_due: int = 0) -> dict[str, Any]:
         """
         Return the requirement's part of the result, in the format of a sink.
 
-        :param missed: further results that are missed so far.
+        :param missed: further results that are missed so far; ``not_due``: that are not due.
         """
         found = self.result()
+        if not_due:
+            found['not_due'] = found.get('not_due', 0) + not_due
         found['late'] += missed
         found['overdue'] += missed
         if self._tolerate is not None and self._window is not None:

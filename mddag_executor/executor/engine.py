@@ -540,6 +540,10 @@ class Engine:
             self._begin_driven(work, work.entity.awaiting)
         if state.x_holds[x]:
             self.holders.append(work)
+        if self.path_watch is not None:
+            begun = work.origin or work.answers
+            if begun is not None:
+                self.path_watch.begun(work, begun.vertex, now)
         return work
 
     def _begin_driven(self, work: Work, awaiting: Awaiting[Origin]) -> None:
@@ -777,7 +781,7 @@ class Engine:
                 for each in completes:
                     if each.vertex in self.path_watch.vertices:
                         self.path_watch.ended(
-                            each.vertex, each.job, start, end,
+                            work, each.vertex, each.job, start, end, work.sent,
                             None if failed else published.get(each), state.scalars[JUDGE_FROM])
             leg = 0 if entity.may_answer else (
                 x - state.job_base[slot] - tables.region_offset[vertex])
@@ -792,6 +796,8 @@ class Engine:
                 note_time(tables, state, vertex, entity.habit.needs_ns, entity.habit.holds, now)
         elif record is not None:
             self._record_run(work, start, end, vtid, worker)
+        if self.path_watch is not None:
+            self.path_watch.left(work)
         if self._state.decisions:
             self._decided(now)
 
@@ -837,6 +843,8 @@ class Engine:
         work.entity.busy_ns += end - start
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker, goes_on=True)
+        if self.path_watch is not None:
+            self.path_watch.paused(work, start, end)
         self._let_go(work)
         self.scheduler.suspend(work.x)
         self._work[work.x] = work
@@ -850,6 +858,8 @@ class Engine:
             return
         self._let_go(work)
         self.scheduler.refuse(x)
+        if self.path_watch is not None:
+            self.path_watch.left(work)
         work.answers = None
         self._work[x] = work
         entity.waiting = {x: None, **entity.waiting}
@@ -866,6 +876,8 @@ class Engine:
             if self.record is not None:
                 self._record_run(work, start, end, vtid, worker)
         self.lend(work)
+        if self.path_watch is not None:
+            self.path_watch.left(work)
         work.x = -1
         work.entity.ran += ran
         work.entity.dropped += not ran
@@ -878,6 +890,8 @@ class Engine:
         if work.origin is not None:
             self.scheduler.give_up(work.origin.slot, EXPIRED, now)
         self._complete(x, now)
+        if self.path_watch is not None:
+            self.path_watch.left(work)
         self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
         self._decided(now)
 

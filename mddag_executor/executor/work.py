@@ -95,6 +95,7 @@ class Work:
     :ivar answers: of a driven sync, the vertex and job that it completes if it publishes; None
         before it starts, and for other callbacks.
     :ivar published: of a driven sync, the topics that it has published.
+    :ivar sent: its publications on topics of ``PathWatch.topics``, with their times.
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar cpu_ns: its CPU time.
@@ -105,7 +106,7 @@ class Work:
 
     __slots__ = (
         'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
-        'ready_ns', 'cpu_ns', 'yields', 'paused_ns', 'answers', 'published')
+        'ready_ns', 'cpu_ns', 'yields', 'paused_ns', 'answers', 'published', 'sent')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -119,6 +120,7 @@ class Work:
         self.origin: Origin | None = None
         self.answers: Origin | None = None
         self.published: frozenset[str] = frozenset()
+        self.sent: tuple[tuple[str, int], ...] = ()
         self.x = self.worker = -1
         self.ready_ns = self.cpu_ns = self.yields = self.paused_ns = 0
 

@@ -179,8 +179,14 @@ class WorkerThread:
         """Note that the running callback publishes."""
         topic = state.topic
         record, work = self.engine.record, self.work
-        if record is not None:
-            record(PUBLICATION, self.pool.clock.now(), self.vtid, state.address, id(msg))
+        watch = self.engine.path_watch
+        is_watched = watch is not None and topic in watch.topics
+        if record is not None or is_watched:
+            now = self.pool.clock.now()
+            if record is not None:
+                record(PUBLICATION, now, self.vtid, state.address, id(msg))
+            if is_watched and work is not None:
+                work.sent += (topic, now),
         if work is not None and topic not in work.entity.publishes:
             work.entity.publishes.add(topic)
         if not self.published:

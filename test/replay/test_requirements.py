@@ -219,16 +219,30 @@ def test_reactions_are_those_of_slow_rules(flows, sampled, required, until):
 
 # --- random systems, simulated ---------------------------------------------------------------
 
-def watched(task_set, recording):
-    """Return what the executor would find in a run."""
+def watched(task_set, recording, chance):
+    """Return what the executor would find in a run whose threads report late and in any order."""
     watch = PathWatch(task_set, None)
     rows = recording.executions
-    done = np.flatnonzero((rows['end'] >= 0) & (rows['start'] >= 0))
-    for row in sorted(done.tolist(), key=lambda row: (rows['end'][row], rows['start'][row])):
-        vertex = int(rows['vertex'][row])
+    vertices = task_set.vertices
+    reports = []
+    for row in np.flatnonzero((rows['end'] >= 0) & (rows['start'] >= 0)).tolist():
+        vertex, start, end = (int(rows[name][row]) for name in ('vertex', 'start', 'end'))
         if vertex in watch.vertices:
-            watch.ended(vertex, int(rows['job'][row]), int(rows['start'][row]),
-                        int(rows['end'][row]), None, -2 ** 62)
+            reports += [(start - chance.randrange(MS), row),
+                        (end + chance.randrange(30 * MS), row)]
+    begun = set()
+    for now, row in sorted(reports):
+        vertex, job, start, end = (
+            int(rows[name][row]) for name in ('vertex', 'job', 'start', 'end'))
+        if row not in begun:
+            begun.add(row)
+            watch.begun(row, vertex, now)
+        else:
+            sent = [(topic, end) for topic in vertices[vertex].callback.publishes]
+            watch.ended(row, vertex, job, start, end, sent, None, -2 ** 62)
+            watch.left(row)
+        if not chance.randrange(50):    # it changes nothing
+            watch.result(now, -2 ** 62)
     return watch.result(recording.judged_until, -2 ** 62)
 
 
@@ -242,7 +256,8 @@ def test_live_verdicts_and_bounds_in_random_systems(seeds):
         found = of_computed(run)
         if not found:
             continue
-        assert watched(task_set, run.recording()) == found['requirements'], seed
+        assert watched(task_set, run.recording(), random.Random(seed)) == (
+            found['requirements']), seed
         for what, each in found['requirements']['p'].items():
             if not result['deadline_missed'] and each['response_ns'] is not None:
                 limit = bound(task_set, task_set.paths[0], what)
