@@ -41,26 +41,50 @@ CLOSE_S = 2.0
 
 
 class Turnstile:
-    """A lock that threads get in the order in which they ask for it."""
+    """
+    A lock that threads get in the order in which they ask for it.
+
+    :ivar owner: the thread that owns it; 0: none does, or it is being passed on.
+    """
 
     def __init__(self) -> None:
+        self.owner = 0
         self._lock = threading.Lock()
         self._is_taken = False
         self._queue: deque[threading.Lock] = deque()
 
     def acquire(self) -> None:
-        """Wait until the calling thread owns it."""
+        """Wait until the calling thread owns it; an interrupt leaves it to the others."""
+        try:
+            self._acquire()
+        except BaseException:
+            if self.owner == get_ident():
+                self.release()
+            raise
+
+    def _acquire(self) -> None:
         with self._lock:
             if not self._is_taken:
                 self._is_taken = True
+                self.owner = get_ident()
                 return
             turn = threading.Lock()
             turn.acquire()
             self._queue.append(turn)
-        turn.acquire()
+        try:
+            turn.acquire()
+            self.owner = get_ident()
+        except BaseException:
+            with self._lock:
+                if turn in self._queue:
+                    self._queue.remove(turn)
+                else:  # it has been passed to this thread
+                    self.owner = get_ident()
+            raise
 
     def release(self) -> None:
         """Pass it to the thread that has waited longest."""
+        self.owner = 0
         with self._lock:
             if self._queue:
                 self._queue.popleft().release()
@@ -97,17 +121,22 @@ class Stepped(Protocol):
 
 class _Stepping(threading.local):
     steps: Stepped | None = None
+    is_passing = False
 
 
 stepping = _Stepping()
-"""Of the calling thread: ``steps``, the coroutine of which a step runs in it."""
+"""
+Of the calling thread: ``steps``, the coroutine of which a step runs in it; ``is_passing``: it is
+inside the turnstile.
+"""
 
 # What is safe in any thread, or is not for callbacks.
 _UNGUARDED = {
     'call_soon_threadsafe', 'run_forever', 'run_until_complete', 'stop', 'is_running',
     'is_closed', 'close', 'shutdown_asyncgens', 'shutdown_default_executor', 'get_debug',
     'set_debug', 'set_task_factory', 'get_task_factory', 'set_default_executor',
-    'set_exception_handler', 'get_exception_handler'}
+    'set_exception_handler', 'get_exception_handler', 'call_exception_handler',
+    'default_exception_handler'}
 
 
 class CallbackLoop(asyncio.SelectorEventLoop):
@@ -115,15 +144,16 @@ class CallbackLoop(asyncio.SelectorEventLoop):
     An event loop whose methods steps of coroutines may use in any thread.
 
     :param warn: receives a line about tasks that are cancelled at the end.
+    :param must_not_wait: whether the calling thread owns a lock that others may need meanwhile.
     """
 
-    def __init__(self, warn: Callable[[str], None]) -> None:
+    def __init__(self, warn: Callable[[str], None], must_not_wait: Callable[[], bool]) -> None:
         selector = _Selector()
         super().__init__(selector)
         selector.loop = self
         self._warn = warn
+        self._must_not_wait = must_not_wait
         self._turnstile = Turnstile()
-        self._owner = 0
         self._wakes_at = 0.0    # when its thread wakes by itself
         self._thread: threading.Thread | None = None
         self._start_lock = threading.Lock()
@@ -131,7 +161,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
 
     def __hash__(self) -> int:
         """Return the hash; its user may be asking for the current task (rule 2)."""
-        if self._owner != get_ident():
+        if not self.is_owner():
             self.join()
         return object.__hash__(self)
 
@@ -153,16 +183,29 @@ class CallbackLoop(asyncio.SelectorEventLoop):
 
     # --- the turnstile ---------------------------------------------------------------------------
 
+    def is_owner(self) -> bool:
+        """Return whether the calling thread may run asyncio code."""
+        return self._turnstile.owner == get_ident()
+
     def own(self) -> None:
         """Let the calling thread run asyncio code."""
-        self._turnstile.acquire()
-        self._owner = get_ident()
+        stepping.is_passing = True
+        try:
+            self._turnstile.acquire()
+        finally:
+            stepping.is_passing = False
 
     def let_others(self, timeout: float | None) -> None:
         """Let other threads run asyncio code while the loop waits for events."""
         self._wakes_at = float('inf') if timeout is None else self._clock() + timeout
-        self._owner = 0
-        self._turnstile.release()
+        self._release()
+
+    def _release(self) -> None:
+        stepping.is_passing = True
+        try:
+            self._turnstile.release()
+        finally:
+            stepping.is_passing = False
 
     def join(self) -> bool:
         """Let the calling thread's step run asyncio code to its end; False: there is no step."""
@@ -177,21 +220,27 @@ class CallbackLoop(asyncio.SelectorEventLoop):
 
     def leave(self, steps: Stepped) -> None:
         """Note that a step that has joined ends or pauses."""
-        asyncio._leave_task(self, steps)  # type: ignore[arg-type]
-        steps.has_joined = False
+        if steps.has_joined:
+            asyncio._leave_task(self, steps)  # type: ignore[arg-type]
+            steps.has_joined = False
         self._give_up()
 
     def _give_up(self) -> None:
         scheduled: Any = self._scheduled  # type: ignore[attr-defined]
         wakes = bool(self._ready) or (  # type: ignore[attr-defined]
             len(scheduled) > 0 and scheduled[0]._when < self._wakes_at)
-        self._owner = 0
-        self._turnstile.release()
+        self._release()
         if wakes:
             self._write_to_self()  # type: ignore[attr-defined]
 
     def guarded(self, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call a method in a thread that does not own the turnstile."""
+        """
+        Call a method in a thread that does not own the turnstile.
+
+        A finalizer may come anywhere: if it must not wait, its call is made by the loop's thread.
+        """
+        if stepping.is_passing or self._must_not_wait():
+            return self.call_soon_threadsafe(partial(method, self, *args, **kwargs))
         if self.join():
             return method(self, *args, **kwargs)
         self._start()
@@ -212,9 +261,9 @@ class CallbackLoop(asyncio.SelectorEventLoop):
             if self._thread is None:
                 runs = threading.Event()
                 self.call_soon_threadsafe(runs.set)
-                self._thread = threading.Thread(
-                    target=self._run, name='mddag-asyncio', daemon=True)
-                self._thread.start()
+                thread = threading.Thread(target=self._run, name='mddag-asyncio', daemon=True)
+                thread.start()
+                self._thread = thread
                 runs.wait()
 
     def _run(self) -> None:
@@ -226,8 +275,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
             try:
                 self._cancel_tasks()
             finally:
-                self._owner = 0
-                self._turnstile.release()
+                self._release()
 
     def _cancel_tasks(self) -> None:
         """Cancel what is not done, and let it end."""
@@ -264,7 +312,7 @@ def _guard(name: str) -> None:
 
     @wraps(method)
     def guarded(self: CallbackLoop, *args: Any, **kwargs: Any) -> Any:
-        if self._owner == get_ident():
+        if self.is_owner():
             return method(self, *args, **kwargs)
         return self.guarded(method, *args, **kwargs)
 

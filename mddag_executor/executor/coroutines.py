@@ -20,11 +20,13 @@ from collections.abc import Callable, Coroutine, Generator, Iterable
 from contextlib import suppress
 import contextvars
 import threading
+import time
 from typing import Any
 
 from mddag_executor.errors import MddagError
 from mddag_executor.executor.asyncio_loop import (
     CallbackLoop,
+    CLOSE_S,
     is_asyncio_future,
     name_of,
     stepping,
@@ -37,10 +39,12 @@ class Loops:
     Gives the coroutines of an executor their event loop, made for the first one.
 
     :param warn: receives a line about coroutines and tasks that are cancelled at the end.
+    :param must_not_wait: see ``CallbackLoop``.
     """
 
-    def __init__(self, warn: Callable[[str], None]) -> None:
+    def __init__(self, warn: Callable[[str], None], must_not_wait: Callable[[], bool]) -> None:
         self._warn = warn
+        self._must_not_wait = must_not_wait
         self._loop: CallbackLoop | None = None
         self._lock = threading.Lock()
 
@@ -48,7 +52,7 @@ class Loops:
         """Return the loop."""
         with self._lock:
             if self._loop is None:
-                self._loop = CallbackLoop(self._warn)
+                self._loop = CallbackLoop(self._warn, self._must_not_wait)
             return self._loop
 
     def end(self, coroutines: Iterable[tuple[str, Steps]]) -> None:
@@ -57,13 +61,22 @@ class Loops:
 
         :param coroutines: those that have begun, with the names of their callbacks.
         """
-        for name, steps in coroutines:
-            if is_asyncio_future(steps.waits_for):
-                self._warn(f'{name}: its coroutine {name_of(steps.get_coro())} has not ended '
-                           'before its executor: it is cancelled')
-                steps.abandon()
-        if self._loop is not None:
-            self._loop.end()
+        try:
+            for name, steps in coroutines:
+                if is_asyncio_future(steps.waits_for):
+                    self._warn(f'{name}: its coroutine {name_of(steps.get_coro())} has not ended '
+                               'before its executor: it is cancelled')
+                    self._abandon(name, steps)
+        finally:
+            if self._loop is not None:
+                self._loop.end()
+
+    def _abandon(self, name: str, steps: Steps) -> None:
+        try:
+            steps.abandon()
+        except Exception as error:
+            self._warn(f'{name}: its coroutine, when it was cancelled, raised '
+                       f'{type(error).__name__}: {error}')
 
 
 class _NoLoop:
@@ -101,6 +114,7 @@ class Steps:
         self._must_cancel = False
         self._n_cancelled = 0
         self._message: Any = None
+        self._waited: tuple[Any, Any] | None = None
 
     # --- the steps -------------------------------------------------------------------------------
 
@@ -138,6 +152,8 @@ class Steps:
 
     def _step(self) -> Any:
         """Run a step in the context of its event loop; return what the coroutine awaits then."""
+        if self._waited is not None:
+            self._forget_waited(*self._waited)
         outer, before = stepping.steps, asyncio._get_running_loop()
         if outer is not None:
             outer.let_others()  # a spin within a step
@@ -175,20 +191,44 @@ class Steps:
                 self._must_cancel = False
         return yielded
 
-    def suspended(self, resume: Callable[[], object]) -> None:
-        """Note that its execution is suspended; ``resume`` makes it ready again."""
+    def suspended(
+        self, resume: Callable[[], object], waits_for: Any = None, callback: Any = None
+    ) -> None:
+        """
+        Note that its execution is suspended.
+
+        :param resume: makes it ready again.
+        :param waits_for: the future that it waits for, which has ``callback`` for its end.
+        """
         self.resume = resume
+        self._waited = None if waits_for is None else (waits_for, callback)
         if self._must_cancel:
             resume()
 
+    def _forget_waited(self, waits_for: Any, callback: Any) -> None:
+        """Leave no callback in a future that it no longer waits for, as it was cancelled."""
+        self._waited = None
+        if not (waits_for.done() or waits_for.cancelled()):
+            waits_for.remove_done_callback(callback)
+
     def let_others(self) -> None:
         """Let other threads run asyncio code: a step ends, or waits for something else."""
-        if self.has_joined:
-            self.loop.leave(self)
+        loop = self.loop
+        if self.has_joined or isinstance(loop, CallbackLoop) and loop.is_owner():
+            loop.leave(self)
 
     def abandon(self) -> None:
         """Cancel the coroutine, which is suspended, and let it run its last step."""
-        self.cancel()
+        waits_for, loop = self.waits_for, self.loop
+        if isinstance(loop, CallbackLoop):
+            loop.guarded(lambda _: self.cancel())
+            end = time.monotonic() + CLOSE_S
+            while not waits_for.done() and time.monotonic() < end:  # a task ends some time later
+                time.sleep(0.001)
+        else:
+            self.cancel()
+        if not waits_for.done():
+            self._must_cancel = True
         try:
             self.send()
             with suppress(RuntimeError):  # it awaits something more, and ignores its end

@@ -77,8 +77,13 @@ class Ending:
             self.upkeep.clear()
         if self.announcements is not None:
             self.announcements.close()
+        try:
+            self._pool.end_coroutines()
+        finally:
+            self._judge()
+
+    def _judge(self) -> None:
         pool = self._pool
-        pool.end_coroutines()
         with pool.lock:
             now = pool.tick()
             end = min(now, pool.stopped_at or now)

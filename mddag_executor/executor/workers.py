@@ -292,14 +292,15 @@ class WorkerPool:
         with self.lock:
             if self._loops is None:
                 from mddag_executor.executor.coroutines import Loops
-                self._loops = Loops(get_logger('mddag_executor').warning)
+                self._loops = Loops(get_logger('mddag_executor').warning, self.is_inside)
             return self._loops
 
     def end_coroutines(self) -> None:
         """Cancel coroutines that await asyncio, and end its event loop; no callback runs."""
         if self._loops is not None:
-            self._loops.end(
-                [(work.entity.name, work.coroutine) for work in self.engine.begun()])
+            with self.lock:
+                several = [(work.entity.name, work.coroutine) for work in self.engine.begun()]
+            self._loops.end(several)
 
     def attach(self, executor: Spinner) -> None:
         """Set the executor; threads do not keep it alive (``ending``)."""
@@ -928,7 +929,10 @@ class WorkerPool:
         else:
             work.yields = 0
             adopt_awaited(awaited, self.executor)
-            awaited.add_done_callback(QuickCallback(resume))
+            callback = QuickCallback(resume)
+            awaited.add_done_callback(callback)
+            work.coroutine.suspended(resume, awaited, callback)
+            return
         work.coroutine.suspended(resume)
 
     @contextmanager

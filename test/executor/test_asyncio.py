@@ -6,6 +6,7 @@ import asyncio
 from collections import Counter
 import os
 import random
+import signal
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ import time
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor import current_job
+from mddag_executor.executor.asyncio_loop import Turnstile
 from mddag_executor.replay import replay
 from mddag_executor.replay.drift import drift_of
 from msg_graph import loads
@@ -355,7 +357,7 @@ def test_coroutines_that_await_asyncio_at_the_end_are_cancelled(ros_context, mak
     executor.add_node(node)
     with Spinning(executor):
         started = executor.create_task(start)
-        assert wait_for(lambda: started.done() and is_suspended(executor))
+        assert wait_for(lambda: started.done() and 'sleep' in str(begun(executor)))
     assert ended == {'callback': 1, 'task': 1} and children[0].cancelled()
     said = capfd.readouterr().err
     assert '/node: sleep (timer 1ms): its coroutine' in said and '.sleep has not ended' in said
@@ -363,8 +365,92 @@ def test_coroutines_that_await_asyncio_at_the_end_are_cancelled(ros_context, mak
     assert not any(t.name == 'mddag-asyncio' for t in threading.enumerate())
 
 
-def is_suspended(executor):
-    return any('sleep' in str(w.coroutine.get_coro()) for w in executor._engine.begun())
+def begun(executor):
+    """Return the names of the coroutines that are suspended."""
+    with executor._pool.lock:
+        return [str(work.coroutine.get_coro()) for work in executor._engine.begun()]
+
+
+def test_a_coroutine_may_fail_when_it_is_cancelled_at_the_end(ros_context, make_node, capfd):
+    """The others are cancelled, too, and the run is judged."""
+    ended = []
+
+    async def fail():
+        try:
+            await asyncio.sleep(100)
+        finally:
+            raise ValueError('too late')
+
+    async def await_a_task():
+        try:
+            await asyncio.create_task(asyncio.sleep(100))
+        except asyncio.CancelledError:
+            ended.append('cancelled')
+            raise
+
+    node = make_node()
+    for callback in (fail, await_a_task):
+        node.create_timer(0.001, callback, callback_group=ReentrantCallbackGroup())
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: len(begun(executor)) == 2)
+        time.sleep(0.01)
+    assert ended == ['cancelled']
+    assert 'when it was cancelled, raised ValueError: too late' in capfd.readouterr().err
+    assert not any(t.name == 'mddag-asyncio' for t in threading.enumerate())
+
+
+def test_a_future_that_stays_keeps_no_callbacks_of_waits_that_are_over(make_executor):
+    stays, done, kept = Future(), Future(), []
+
+    async def wait():
+        for _ in range(5):
+            with pytest.raises(asyncio.TimeoutError):
+                await asyncio.wait_for(asyncio.shield(wrapped()), 0.001)
+            with pytest.raises(asyncio.CancelledError):
+                asyncio.get_running_loop().call_later(0.001, asyncio.current_task().cancel)
+                await stays
+        kept.append(len(stays._callbacks))
+        done.set_result(None)
+
+    async def wrapped():
+        await asyncio.sleep(0.003)
+
+    executor = make_executor()
+    executor.create_task(wait)
+    spin(executor, done)
+    assert kept == [0]
+
+
+def test_the_turnstile_outlives_an_interrupt_and_a_finalizer(make_executor):
+    """An interrupted thread gives its turn up; a finalizer under the engine's lock waits not."""
+    turnstile = Turnstile()
+    turnstile.acquire()
+    main = threading.main_thread().ident
+    interrupt = threading.Timer(0.05, signal.pthread_kill, (main, signal.SIGINT))
+    interrupt.start()
+    with pytest.raises(KeyboardInterrupt):
+        turnstile.acquire()
+    turnstile.release()
+    turnstile.acquire()
+
+    executor, is_held, ends = make_executor(), threading.Event(), threading.Event()
+    loop = executor._pool.loops().loop()
+
+    def hold():
+        loop.own()
+        is_held.set()
+        ends.wait(15)
+        loop.let_others(None)
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    assert is_held.wait(15)
+    with executor._pool.lock:  # where garbage may be collected
+        loop.call_soon(int)
+    ends.set()
+    holder.join()
 
 
 def test_without_coroutines_there_is_no_loop():
