@@ -844,7 +844,8 @@ class Engine:
         if self.record is not None:
             self._record_run(work, start, end, vtid, worker, goes_on=True)
         if self.path_watch is not None:
-            self.path_watch.paused(work, start, end)
+            _, _, job, vertex = work.origin or work.answers or NO_ORIGIN
+            self.path_watch.paused(work, vertex, job, start, end, work.sent)
         self._let_go(work)
         self.scheduler.suspend(work.x)
         self._work[work.x] = work

@@ -20,16 +20,20 @@ with an earlier time can come any more.  Executions that are dispatched but not 
 bring times from their dispatch on.  The order at the same instant is: ends, publications, starts.
 A result in between takes what still waits as complete, on a copy.
 
+A change is found to be not due when the next output comes.  A replay knows what follows: that an
+output with just this input comes after that of a newer one, or that a value with which nothing
+was published is read again and leads to an output.
+
 A path is only judged in a process that runs all of its callbacks.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
 import copy
 from heapq import heappop, heappush
-from typing import Any
+from typing import Any, NamedTuple
 
 from mddag_executor.core.requirements import RequirementTally, Rules
 from msg_graph import Path, TaskSet
@@ -65,17 +69,22 @@ class PathWatch:
                 self._of.setdefault(vertex, []).append((path, position))
         self.vertices = self._of.keys()
         self.topics = frozenset().union(*(path.topics for path in self._paths))
-        # by execution the starts and ends of its pieces before the last
-        self._pieces: dict[Hashable, list[tuple[int, int]]] = {}
+        # executions that go on later
+        self._paused: dict[Hashable, _Paused] = {}
 
     def begun(self, work: Hashable, vertex: int, now: int) -> None:
         """Note that an execution is dispatched, or goes on; its start is not before now."""
         for path, _ in self._of.get(vertex, ()):
             path.open.setdefault(work, now)
 
-    def paused(self, work: Hashable, start: int, end: int) -> None:
-        """Note a piece of an execution that goes on later."""
-        self._pieces.setdefault(work, []).append((start, end))
+    def paused(
+        self, work: Hashable, vertex: int, job: int, start: int, end: int,
+        sent: Iterable[tuple[str, int]],
+    ) -> None:
+        """Note a piece of an execution that goes on later, and its publications so far."""
+        if vertex in self._of:
+            before = self._paused[work].pieces if work in self._paused else []
+            self._paused[work] = _Paused(vertex, job, [*before, (start, end)], sent)
 
     def ended(
         self, work: Hashable, vertex: int, job: int, start: int, end: int,
@@ -89,20 +98,21 @@ class PathWatch:
         :param published: which topics of ``may_publish`` it published; None: it has none.
         :param judge_from: earlier changes and inputs are not judged.
         """
-        pieces = [*self._pieces.get(work, ()), (start, end)]
+        before = self._paused[work].pieces if work in self._paused else []
         for path, position in self._of[vertex]:
-            path.ended(position, vertex, job, pieces, sent, published, judge_from)
+            path.ended(position, vertex, job, [*before, (start, end)], sent, published, judge_from)
 
     def left(self, work: Hashable) -> None:
         """Note that an execution brings no more times: it has ended, or will not run."""
-        self._pieces.pop(work, None)
+        self._paused.pop(work, None)
         for path in self._paths:
             path.open.pop(work, None)
             path.go_on()
 
     def result(self, now: int, judge_from: int) -> dict[str, Any]:
         """Return by path, and 'reaction' or 'age', its result in the format of a sink."""
-        return {path.name: path.result(now, judge_from) for path in self._paths}
+        return {path.name: path.result(now, judge_from, self._paused.values())
+                for path in self._paths}
 
 
 def is_divided(task_set: TaskSet, path: Path) -> bool:
@@ -110,10 +120,27 @@ def is_divided(task_set: TaskSet, path: Path) -> bool:
     return len({task_set.process_of(key.rpartition(':')[0]) for key in path.callbacks}) > 1
 
 
-class _Run:
-    """An execution; ``found`` is the input that its data has, None: none is known."""
+class _Paused(NamedTuple):
+    """The pieces and publications of an execution that goes on later."""
 
-    __slots__ = ('position', 'vertex', 'job', 'is_silent', 'judge_from', 'is_begun', 'found')
+    vertex: int
+    job: int
+    pieces: list[tuple[int, int]]
+    sent: Iterable[tuple[str, int]]
+
+
+class _Run:
+    """
+    An execution.
+
+    :ivar found: the input that its data has; None: none is known.
+    :ivar number: its number; ``value``: that of the value of a queue edge that it has read, or its
+        own.
+    """
+
+    __slots__ = (
+        'position', 'vertex', 'job', 'is_silent', 'judge_from', 'is_begun', 'found',
+        'number', 'value')
 
     def __init__(
         self, position: int, vertex: int, job: int, is_silent: bool, judge_from: int,
@@ -125,6 +152,11 @@ class _Run:
         self.judge_from = judge_from
         self.is_begun = False
         self.found: int | None = None
+        self.number = self.value = 0
+
+
+_Event = tuple[int, int, int, _Run, bool]
+"""Time, kind, a number, the execution, and whether it is its last end."""
 
 
 class _Path:
@@ -142,11 +174,10 @@ class _Path:
             for key, hop in zip(path.callbacks, self._hops)]
         self.topics = frozenset().union(
             *(hop.topics for hop in self._hops if hop.kind == 'topic'))
-        self._state = _State(task_set, path)
+        self._state = _State(task_set, path, self._may_end)
         self.positions = self._state.positions
         self.open: dict[Hashable, int] = {}
-        # time, kind, a number, the execution, and whether it is the last end
-        self._events: list[tuple[int, int, int, _Run, bool]] = []
+        self._events: list[_Event] = []
         self._number = 0
 
     def ended(
@@ -162,16 +193,24 @@ class _Path:
             elif published is not None:
                 is_silent = self._may_end[position] and published.isdisjoint(hop.topics)
         run = _Run(position, vertex, job, is_silent, judge_from)
-        self._add(pieces[0][0], _START, run)
-        for time in times:
-            self._add(time, _PUBLICATION, run)
-        for _, end in pieces[:-1]:
-            self._add(end, _END, run)
-        self._add(pieces[-1][1], _END, run, True)
+        for event in self._all_of(run, pieces, times):
+            heappush(self._events, event)
+        end = pieces[-1][1]
+        heappush(self._events, (end, _END, self._next(), run, True))
 
-    def _add(self, time: int, kind: int, run: _Run, is_last: bool = False) -> None:
+    def _all_of(
+        self, run: _Run, pieces: list[tuple[int, int]], times: list[int],
+    ) -> Iterator[_Event]:
+        """Yield the start of an execution, its publications, and the ends of all but the last."""
+        yield pieces[0][0], _START, self._next(), run, False
+        for time in times:
+            yield time, _PUBLICATION, self._next(), run, False
+        for _, end in pieces[:-1]:
+            yield end, _END, self._next(), run, False
+
+    def _next(self) -> int:
         self._number += 1
-        heappush(self._events, (time, kind, self._number, run, is_last))
+        return self._number
 
     def go_on(self) -> None:
         """Let those times take effect that nothing earlier can follow."""
@@ -181,10 +220,21 @@ class _Path:
                 until is None or events[0][0] < until or len(events) > _MOST_WAITING):
             self._state.take(*heappop(events))
 
-    def result(self, now: int, judge_from: int) -> dict[str, Any]:
-        state = self._state
-        if self._events:
-            state, events = copy.deepcopy((state, sorted(self._events)))
+    def result(
+        self, now: int, judge_from: int, paused: Iterable[_Paused] = (),
+    ) -> dict[str, Any]:
+        state, events = self._state, [*self._events]
+        for each in paused:
+            position = self.positions.get(each.vertex)
+            if position is not None:    # all of its pieces so far have ended
+                hop = self._hops[position] if position < len(self._hops) else None
+                run = _Run(position, each.vertex, each.job, False, judge_from)
+                last = each.pieces[-1][1]
+                events += self._all_of(run, [*each.pieces, (last, last)], [
+                    time for topic, time in each.sent
+                    if hop is not None and hop.kind == 'topic' and topic in hop.topics])
+        if events:
+            state, events = copy.deepcopy((state, sorted(events)))
             for event in events:
                 state.take(*event)
         return state.result(now, judge_from)
@@ -193,7 +243,7 @@ class _Path:
 class _State:
     """The flows of a path and their results up to a time."""
 
-    def __init__(self, task_set: TaskSet, path: Path) -> None:
+    def __init__(self, task_set: TaskSet, path: Path, may_end: list[bool]) -> None:
         self._rules = Rules(task_set, path)
         self._last = len(path.callbacks) - 1
         place = {key: position for position, key in enumerate(path.callbacks)}
@@ -212,39 +262,45 @@ class _State:
         self._is_sync = [task_set.callback(key).kind == 'sync' for key in path.callbacks]
         # by vertex and job the input that its execution had
         self._inputs: dict[int, dict[int, int]] = {vertex: {} for vertex in self.positions}
-        # by position of a queue edge the input of the latest value
-        self._latest: list[int | None] = [None for _ in path.callbacks]
+        self._may_end = may_end
+        # by position of a queue edge the number and the input of the latest value
+        self._latest: list[tuple[int, int | None]] = [(0, None) for _ in path.callbacks]
         # inputs, and the changes that they will have seen, that are not answered yet
         self._pending: deque[tuple[int, int]] = deque()
         self._last_input: int | None = None
-        # changes up to this input are not due, unless an output is based on just their input
-        self._silent_to: int | None = None
+        # by value the input with which nothing was published: changes up to it are not due, unless
+        # an output is based on just their input; values with which something was published
+        self._silent: dict[int, int] = {}
+        self._silent_before = -1
+        self._went_on: dict[int, None] = {}
         self._silent_since: int | None = None
         self._tallies = {what: RequirementTally(path, required, _KEEP_RESPONSES)
                          for what, required in path.requirements.items()}
 
     def take(self, time: int, kind: int, number: int, run: _Run, is_last: bool) -> None:
         """Let a start, a publication or an end take effect."""
+        if not run.is_begun:    # its start, or all are at the same instant
+            self._begin(run, time, number)
         if kind == _START:
-            self._begin(run, time)
             return
-        if not run.is_begun:    # all at the same instant
-            self._begin(run, time)
         position, found = run.position, run.found
         if position == self._last:
             if is_last and found is not None:
                 self._output(found, time, run.judge_from)
             return
-        if is_last and run.is_silent and found is not None:
-            self._silent_to = max(found, found if self._silent_to is None else self._silent_to)
+        if is_last and found is not None and run.is_silent and run.value not in self._went_on:
+            self._silent[run.value] = found
+            if len(self._silent) > _REMEMBERED:
+                oldest = self._silent.pop(next(iter(self._silent)))
+                self._silent_before = max(self._silent_before, oldest)
         if kind == _PUBLICATION or self._kinds[position] == 'variable':
             if found is not None or not self._is_sync[position]:
-                self._latest[position] = found
+                self._latest[position] = (
+                    number if kind == _PUBLICATION else run.number), found
 
-    def _begin(self, run: _Run, start: int) -> None:
-        if run.is_begun:
-            return
+    def _begin(self, run: _Run, start: int, number: int) -> None:
         run.is_begun = True
+        run.number = run.value = number
         if not run.position:
             self._input(start, run.judge_from)
             run.found = start
@@ -253,7 +309,12 @@ class _State:
                 self._inputs[each][run.job] for each in self._before[run.vertex]
                 if run.job in self._inputs[each]), default=None)
         else:
-            run.found = self._latest[run.position - 1]
+            run.value, run.found = self._latest[run.position - 1]
+        if run.position < self._last and self._may_end[run.position] and not run.is_silent:
+            self._silent.pop(run.value, None)
+            self._went_on[run.value] = None
+            if len(self._went_on) > _REMEMBERED:
+                del self._went_on[next(iter(self._went_on))]
         if run.found is not None:
             inputs = self._inputs[run.vertex]
             inputs[run.job] = run.found
@@ -275,25 +336,29 @@ class _State:
             newest, _ = self._pending.popleft()
             if 'reaction' not in self._tallies:
                 pass
-            elif self._is_silent(newest):
+            elif newest <= self._silent_to():
                 self._tallies['reaction'].add_not_due()
             else:
                 self._tallies['reaction'].add_missed()
 
-    def _is_silent(self, newest: int) -> bool:
-        """Return whether nothing was published for an input, or for a later one."""
-        return self._silent_to is not None and newest <= self._silent_to
+    def _silent_to(self) -> int:
+        """Return the last input with which nothing was published; -1: there is none."""
+        return max((*self._silent.values(), self._silent_before))
 
     def _output(self, found: int, end: int, judge_from: int) -> None:
         reaction, age = self._tallies.get('reaction'), self._tallies.get('age')
+        silent_to = self._silent_to()
         while self._pending and self._pending[0][0] <= found:
             newest, since = self._pending.popleft()
             if reaction is None:
                 continue
-            if newest != found and self._is_silent(newest):
+            if newest != found and newest <= silent_to:
                 reaction.add_not_due()
             else:
                 reaction.add(end - since)
+        for value, silent in [*self._silent.items()]:
+            if silent <= found:
+                del self._silent[value]
         if age is not None and found >= judge_from:
             age.add(end - found)
             self._silent_since = end
@@ -304,10 +369,10 @@ class _State:
             required = tally.relative_deadline_ns
             not_due = 0
             if what == 'reaction':
-                silent = [self._is_silent(newest) for newest, _ in self._pending]
-                not_due = sum(silent)
-                missed = sum(since + required <= now and not is_silent
-                             for (_, since), is_silent in zip(self._pending, silent))
+                silent_to = self._silent_to()
+                not_due = sum(newest <= silent_to for newest, _ in self._pending)
+                missed = sum(since + required <= now and newest > silent_to
+                             for newest, since in self._pending)
             else:
                 missed = 0 if self._silent_since is None else self._rules.missing_outputs(
                     self._silent_since, now, required)

@@ -169,6 +169,54 @@ def test_what_is_not_published_is_not_due(tmp_path):
         'reaction': (2, 0, 0, 7, 14), 'age': (2, 0, 0, 0, 4)}
 
 
+def test_a_run_finds_what_is_not_due_and_goes_on_later(tmp_path):
+    """The input at 30 leads to an output at 47; those at 40 publish nothing until then."""
+    told = Told(tmp_path / 'a.mcap', RARE)
+    watch = PathWatch(told.task_set, None)
+    look, stop = 0, 1
+    for at in range(0, 100, 10):
+        seen = at == 30
+        told.ran('/a:look', at, at + 2, sends=[(at + 1, '/alarm')] * seen)
+        watch.begun(at, look, at * MS)
+        watch.ended(at, look, at, at * MS, (at + 2) * MS, (), {'/alarm'} if seen else set(), 0)
+        watch.left(at)
+        if seen:
+            told.ran('/a:stop', at + 2, at + 17, at + 1, '/alarm')
+            watch.begun('stop', stop, (at + 2) * MS)
+    watch.ended('stop', stop, 30, 32 * MS, 47 * MS, (), None, 0)
+    watch.left('stop')
+    found = {'requirements': watch.result(92 * MS, 0)}
+    expected = {'reaction': (0, 1, 0, 8, 27), 'age': (0, 1, 0, 0, 17)}
+    assert counts(found) == expected
+    assert counts(replay(told.write(), told.task_set).result()) == expected
+    # a coroutine begins with its first piece
+    watch.begun('later', look, 100 * MS)
+    watch.paused('later', look, 100, 100 * MS, 101 * MS, ())
+    watch.begun('later', look, 120 * MS)
+    watch.ended('later', look, 100, 120 * MS, 121 * MS, (), {'/alarm'}, 0)
+    watch.left('later')
+    watch.ended('stop', stop, 100, 121 * MS, 123 * MS, (), None, 0)
+    watch.left('stop')
+    assert counts({'requirements': watch.result(130 * MS, 0)})['age'] == (0, 2, 0, 0, 23)
+
+
+TOPIC = RARE.replace('may_publish: [/alarm]', 'publishes: [/alarm], deadline: none').replace(
+    'subscription: /alarm', 'timer: 10ms, reads: [/alarm]')
+
+
+def test_a_run_reads_a_topic_when_it_is_published():
+    """The reader begins at 5, after the publication at 1 and before the writer's end at 9."""
+    watch = PathWatch(loads(TOPIC, 'g'), None)
+    look, stop = 0, 1
+    watch.begun('look', look, 0)
+    watch.begun('stop', stop, 5 * MS)
+    watch.ended('stop', stop, 0, 5 * MS, 6 * MS, (), None, 0)
+    watch.left('stop')
+    watch.ended('look', look, 0, 0, 9 * MS, [('/alarm', MS)], None, 0)
+    watch.left('look')
+    assert counts({'requirements': watch.result(10 * MS, 0)})['age'] == (1, 0, 0, 0, 6)
+
+
 # --- against slow rules ----------------------------------------------------------------------
 
 TIMES = st.integers(0, 60)
