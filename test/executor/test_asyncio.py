@@ -226,7 +226,7 @@ def test_groups_and_jobs_are_kept_while_a_callback_sleeps(make_executor, make_no
 
     node.create_timer(0.01, lambda: publisher.publish(Header()),
                       callback_group=MutuallyExclusiveCallbackGroup())
-    node.create_timer(0.004, lambda: sleep('other'))
+    node.create_timer(0.015, lambda: sleep('other'))
     node.create_subscription(Header, '/a', hear, 10)
     text = graph(n="""
         name: tick, timer: 10ms, publishes: [/a]
@@ -376,12 +376,14 @@ def test_a_coroutine_may_fail_when_it_is_cancelled_at_the_end(ros_context, make_
     ended = []
 
     async def fail():
+        timers[0].cancel()
         try:
             await asyncio.sleep(100)
         finally:
             raise ValueError('too late')
 
     async def await_a_task():
+        timers[1].cancel()
         try:
             await asyncio.create_task(asyncio.sleep(100))
         except asyncio.CancelledError:
@@ -389,8 +391,8 @@ def test_a_coroutine_may_fail_when_it_is_cancelled_at_the_end(ros_context, make_
             raise
 
     node = make_node()
-    for callback in (fail, await_a_task):
-        node.create_timer(0.001, callback, callback_group=ReentrantCallbackGroup())
+    timers = [node.create_timer(0.01, callback, callback_group=ReentrantCallbackGroup())
+              for callback in (fail, await_a_task)]
     executor = MultiDeadlineExecutor(context=ros_context)
     executor.add_node(node)
     with Spinning(executor):
