@@ -17,10 +17,9 @@ tools use all of its identifiers, the two share the GIL.
 2.  It pauses in code of the user's own only: never in this package, in rclpy or in Python's
     library, which may own locks that others need at once.
 3.  A callback may pause while it owns a lock that the urgent one needs.  So the paused thread
-    checks every ``CHECK_S`` whether the urgent one computes.  If that got no CPU since the last
-    check, and is asleep, the paused one goes on, and the urgent one gives the GIL up.  (A thread
-    that waits for the GIL wakes up every switch interval; one that waits for a CPU is not
-    asleep.)
+    checks every ``CHECK_S``, by a ``GilCheck`` of its own, whether the execution that holds the
+    GIL computes.  If it waits, or polls for what it waits for, it gives the GIL up, and the paused
+    one goes on.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from types import CodeType, FrameType
 from typing import Any
 
 import mddag_executor
-from mddag_executor.executor.gil import cpu_ns, schedule_of
+from mddag_executor.executor.gil import GilCheck
 import rclpy
 
 PAUSES_BY_S = 0.001
@@ -52,18 +51,16 @@ class Pause:
     One pause of a thread; all methods but ``wait_for_it`` and ``take`` need the engine's lock.
 
     :param thread: the ``WorkerThread`` that pauses.
-    :param urgent: that of the callback that overtakes it, or of another one after that.
     :ivar is_watching: whether the thread checks that while it pauses, or as soon as it does.
     :ivar since: when it was asked to pause (monotonic ns).
     """
 
-    __slots__ = ('_thread', 'ident', 'urgent', '_may_go_on', '_has_begun', '_codes', '_is_taken',
+    __slots__ = ('_thread', 'ident', '_may_go_on', '_has_begun', '_codes', '_is_taken',
                  'is_watching', 'since')
 
-    def __init__(self, thread: Any, urgent: Any) -> None:
+    def __init__(self, thread: Any) -> None:
         self._thread = thread
         self.ident = thread.ident
-        self.urgent = urgent
         self._may_go_on = threading.Lock()
         self._may_go_on.acquire()
         self._has_begun = threading.Lock()
@@ -90,28 +87,27 @@ class Pause:
         if measurement is not None:
             measurement.pause()
         begun = monotonic_ns()
-        self._has_begun.release()
-        urgent_computes = self._wait()
-        self.is_watching = False
-        self._thread.paused_ns += monotonic_ns() - begun
-        if measurement is not None:
-            measurement.resume()
-        if not urgent_computes:
-            self._thread.pool.overtaker_waits(self.urgent)
+        try:
+            self._has_begun.release()
+            self._wait()
+        finally:  # also after an interrupt
+            self.is_watching = False
+            self._thread.paused_ns += monotonic_ns() - begun
+            if measurement is not None:
+                measurement.resume()
 
-    def _wait(self) -> bool:
-        """Wait for ``end``; return False if the urgent callback waits before."""
-        own, slept = cpu_ns(self.urgent.ident), -2
-        while not self._may_go_on.acquire(timeout=CHECK_S):
-            before, own = own, cpu_ns(self.urgent.ident)
-            if own > before:
-                slept = -2
-                continue
-            schedule = schedule_of(self.urgent.vtid)
-            if schedule.is_asleep and schedule.slices in (slept, -1):
-                return False  # it may wait for a lock of this one
-            slept = schedule.slices
-        return True
+    def _wait(self) -> None:
+        """Wait for ``end``, which is called too when what holds the GIL does not compute."""
+        pool = self._thread.pool
+        check, work = GilCheck(), None
+        while True:
+            before, (work, urgent) = work, pool.overtaker()
+            if work is not before:
+                check = GilCheck()
+            if urgent is not None and check.waits(urgent.ident, urgent.vtid, monotonic_ns()):
+                pool.overtaker_waits(work)  # it may need a lock of this one
+            if self._may_go_on.acquire(timeout=CHECK_S):
+                return
 
     def end(self) -> None:
         """Let the thread go on."""

@@ -175,6 +175,12 @@ class WorkerThread:
             work.entity.wall_ns <= SHORT_CALLBACK_NS
             or self.published > 0 and work.entity.tail_ns <= SHORT_CALLBACK_NS)
 
+    def wait_for_pause(self) -> None:
+        """Wait until the callback that this one has just overtaken has paused."""
+        pause, self.pause = self.pause, None
+        if pause is not None:
+            pause.wait_for_it()
+
     def publishes(self, state: PublisherState, msg: Any) -> None:
         """Note that the running callback publishes."""
         topic = state.topic
@@ -748,8 +754,7 @@ class WorkerPool:
         self._become(me, ThreadState.RUNNING)
         is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
         computes = bool(engine.holders) and engine.holders[-1] is work
-        if computes and len(engine.holders) > 1 and engine.pauses:
-            self._pause(engine.holders[-2], me)
+        self._pause_for(work, me)
         me.is_spare = not (is_short or computes)
         if self.is_stepping:
             due.arm(now - self._offset)
@@ -768,29 +773,35 @@ class WorkerPool:
                 due.look(now - self._offset)
         return True
 
-    def _pause(self, overtaken: Work, me: WorkerThread) -> None:
-        """Let a callback pause for that of the calling thread; the caller holds the lock."""
+    def _pause_for(self, work: Work, me: WorkerThread) -> None:
+        """Let the callback pause that an execution overtakes; the caller holds the lock."""
+        holders = self.engine.holders
+        if len(holders) < 2 or holders[-1] is not work or not self.engine.pauses:
+            return
+        overtaken = holders[-2]
         thread = self.thread_of(overtaken)
         if thread is None:
             return
-        pause = self._pauses.get(overtaken)
-        if pause is None:
-            me.pause = self._pauses[overtaken] = Pause(thread, me)
-        else:  # the last one has just ended
-            pause.urgent = me
+        if overtaken not in self._pauses:  # else the last one that overtook it has just ended
+            me.pause = self._pauses[overtaken] = Pause(thread)
 
     @property
     def is_watched(self) -> bool:
         """Return whether a paused thread checks the execution that holds the GIL."""
         return any(pause.is_watching for pause in self._pauses.values())
 
-    def overtaker_waits(self, urgent: WorkerThread) -> None:
-        """Take the GIL from the execution of a thread that does not compute."""
+    def overtaker(self) -> tuple[Work | None, WorkerThread | None]:
+        """Return the execution that holds the GIL, and its thread."""
+        with self.lock:
+            holder = self.engine.interpreter_holder()
+            return holder, None if holder is None else self.thread_of(holder)
+
+    def overtaker_waits(self, urgent: Work) -> None:
+        """Take the GIL from an execution that does not compute."""
         with self.lock:
             self.tick()
-            holder = self.engine.interpreter_holder()
-            if holder is not None and urgent.work is holder:
-                self.engine.stop_holding(holder)
+            if self.engine.interpreter_holder() is urgent:
+                self.engine.stop_holding(urgent)
                 self.end_pauses()
                 self.wake_for_more()
 
@@ -832,8 +843,7 @@ class WorkerPool:
         me.measurement = measurement
         me.published = me.paused_ns = 0
         if me.pause is not None:
-            pause, me.pause = me.pause, None
-            pause.wait_for_it()
+            me.wait_for_pause()
         start = monotonic_ns()
         try:
             if group is not None and work.coroutine is None and (
@@ -1003,6 +1013,7 @@ class WorkerPool:
                 elif (work in self._rejoining and before[0] == seen[0]
                         and seen[1] - before[1] < REJOIN_NS // 10):
                     self._go_on_without(work)
+        me.wait_for_pause()
 
     def _hand_over(self, work: Work, now: int) -> None:
         """Let an execution go on that was dispatched again; the caller holds the lock."""
@@ -1011,6 +1022,7 @@ class WorkerPool:
         thread.worker = work.worker
         thread.is_out = False
         self._waiting_calls -= 1
+        self._pause_for(work, thread)
         thread.permit.release()
         if self.engine.holders and self.engine.has_waiting:
             self.due.check_holder(now - self._offset)

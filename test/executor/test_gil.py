@@ -245,6 +245,29 @@ def test_a_callback_that_owns_a_lock_does_not_pause_for_ever(computing, is_held_
         assert computing.order('urgent') == ['begins', 'urgent', 'ends']
 
 
+def test_a_callback_that_owns_a_lock_goes_on_for_one_that_polls_for_it(computing):
+    """To poll takes CPU time, but not so much as to compute."""
+    lock, tries, got = threading.Lock(), threading.Event(), []
+
+    def meanwhile():
+        with lock:
+            while not tries.is_set():
+                compute(1)
+        return 'urgent' in computing.ran
+
+    def urgent():
+        tries.set()
+        end = time.monotonic() + 10.0
+        while not got and time.monotonic() < end:
+            if lock.acquire(timeout=0.001):
+                got.append(1)
+                lock.release()
+
+    computing.meanwhile, computing.urgent, computing.takes = meanwhile, urgent, 0
+    assert computing.order('urgent') == ['begins', 'urgent', 'ends']
+    assert got
+
+
 # --- callbacks that lend their workers, and go on ------------------------------------------------
 
 class Lending:
@@ -338,6 +361,34 @@ def test_others_wait_for_a_callback_that_goes_on(make_executor, make_node):
         lending.leave.set()
         assert wait_for(lambda: len(lending.ran) == 4)
     assert lending.ran == ['lends', 'goes on', 'ends', 'patient']
+
+
+@pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
+def test_a_callback_pauses_for_a_more_urgent_one_that_goes_on(make_executor, make_node):
+    lending = Lending(make_executor, make_node, 7, lends='1s', blocks='60s')
+    steps, still = [0], []
+
+    def step():
+        while not lending.leave.is_set():
+            steps[0] += 1
+            compute(1)
+
+    def then():
+        end = time.monotonic() + 10.0
+        while not still and time.monotonic() < end:
+            before = steps[0]
+            compute(20)
+            if steps[0] == before:
+                still.append(before)
+        lending.leave.set()
+
+    lending.compute, lending.then = step, then
+    with Spinning(lending.executor):
+        lending.start('lends')
+        lending.start('blocks')
+        lending.go_on()
+        assert wait_for(lambda: is_idle(lending.executor))
+    assert still
 
 
 @pytest.mark.parametrize('is_async', [False, True])

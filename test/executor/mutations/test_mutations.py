@@ -198,7 +198,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'executor/pausing.py', 'pause.take()', 'pass')], of(
         'test_gil.py', 'test_a_callback_pauses_while_a_more_urgent_one_computes[here]')),
     Case('paused_callbacks_wait_for_ever', [(
-        'executor/pausing.py', 'return False  # it may wait for a lock of this one', 'pass')], of(
+        'executor/pausing.py', 'pool.overtaker_waits(work)', 'pass')], of(
         'test_gil.py', 'test_a_callback_that_owns_a_lock_does_not_pause_for_ever[here-user]')),
     Case('nobody_looks', [(
         'executor/workers.py', """\
