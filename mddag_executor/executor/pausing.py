@@ -41,9 +41,10 @@ PAUSES_BY_S = 0.001
 CHECK_S = 0.002
 
 _monitoring: Any = getattr(sys, 'monitoring', None)
-_LIBRARY = sysconfig.get_path('stdlib')
+_LIBRARY = os.path.join(sysconfig.get_path('stdlib'), '')
 _FOREIGN = ('site-packages', 'dist-packages')
-_KEPT_OUT = tuple(os.path.dirname(module.__file__ or '') for module in (mddag_executor, rclpy))
+_KEPT_OUT = tuple(
+    os.path.join(os.path.dirname(module.__file__ or ''), '') for module in (mddag_executor, rclpy))
 
 
 class Pause:
@@ -79,7 +80,7 @@ class Pause:
 
     def take(self) -> None:
         """Pause; called by the thread itself."""
-        if self._is_taken:
+        if self._is_taken or self._thread.pool.is_inside():  # in a finalizer of the user's
             return
         self._is_taken = True
         _monitor.end(self, self._codes)
@@ -124,7 +125,8 @@ class _Monitor:
 
     def __init__(self) -> None:
         self._pauses: dict[int, Pause] = {}
-        self._users: dict[CodeType, int] = {}
+        # by id, as different code may be equal; a pause keeps its code alive
+        self._users: dict[int, int] = {}
         self._lock = threading.RLock()
         self._tool = -1
 
@@ -153,7 +155,7 @@ class _Monitor:
         with self._lock:
             self._pauses[pause.ident] = pause
             for code in codes:
-                users = self._users[code] = self._users.get(code, 0) + 1
+                users = self._users[id(code)] = self._users.get(id(code), 0) + 1
                 if users == 1:
                     _monitoring.set_local_events(self._tool, code, events)
 
@@ -164,9 +166,9 @@ class _Monitor:
                 return
             del self._pauses[pause.ident]
             for code in codes:
-                self._users[code] -= 1
-                if not self._users[code]:
-                    del self._users[code]
+                self._users[id(code)] -= 1
+                if not self._users[id(code)]:
+                    del self._users[id(code)]
                     _monitoring.set_local_events(self._tool, code, 0)
 
 
@@ -181,7 +183,8 @@ def _own_code(frame: FrameType | None) -> Iterator[CodeType]:
         code = frame.f_code
         path = code.co_filename
         in_library = path.startswith(_LIBRARY) and not any(name in path for name in _FOREIGN)
-        if code not in seen and not in_library and not path.startswith((*_KEPT_OUT, '<frozen')):
-            seen.add(code)
+        is_kept_out = in_library or path.startswith((*_KEPT_OUT, '<frozen'))
+        if id(code) not in seen and not is_kept_out:
+            seen.add(id(code))
             yield code
         frame = frame.f_back

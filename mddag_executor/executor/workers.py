@@ -169,9 +169,9 @@ class WorkerThread:
         self.vtid, self.ident = threading.get_native_id(), threading.get_ident()
 
     def is_short(self) -> bool:
-        """Return whether the thread runs a short callback."""
+        """Return whether the thread runs a short callback that has its worker."""
         work = self.work
-        return work is not None and (
+        return work is not None and not self.is_out and (
             work.entity.wall_ns <= SHORT_CALLBACK_NS
             or self.published > 0 and work.entity.tail_ns <= SHORT_CALLBACK_NS)
 
@@ -445,21 +445,23 @@ class WorkerPool:
 
     def pause(self) -> None:
         """Start no more executions; running ones finish.  No thread waits in the epoll then."""
-        with self.lock:
-            self.start_no_more()
-            self._let_go_on()
-            self.due.arm(0)
-            if not self.polling or self._leaving:
-                return
-            self._leaving = True
-            self._all_left.clear()
-            self.loop.wake_all()
+        is_first = False
         try:
+            with self.lock:
+                self.start_no_more()
+                self._let_go_on()
+                self.due.arm(0)
+                if not self.polling or self._leaving:
+                    return
+                is_first = self._leaving = True
+                self._all_left.clear()
+                self.loop.wake_all()
             self._all_left.wait(END_S)
         finally:  # also after an interrupt
-            with self.lock:
-                self._leaving = False
-                self.loop.let_wait()
+            if is_first:
+                with self.lock:
+                    self._leaving = False
+                    self.loop.let_wait()
 
     def start_no_more(self) -> None:
         """Start no more executions; for callers that must not wait for the lock."""

@@ -8,10 +8,12 @@ import random
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
-from mddag_executor.executor import publishing
+from mddag_executor.executor import pausing, publishing
 from mddag_executor.executor.compat import function_of_task
 from mddag_executor.executor.pausing import can_pause
+from mddag_executor.executor.work import current
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionServer
@@ -268,6 +270,71 @@ def test_a_callback_that_owns_a_lock_goes_on_for_one_that_polls_for_it(computing
     assert got
 
 
+def code_of(path):
+    """Return new code in a file: equal to other new code of the same file."""
+    found = {}
+    exec(compile('import sys\ndef function():\n    return sys._getframe()\n', path, 'exec'), found)
+    return found['function']
+
+
+@pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
+def test_equal_code_is_told_apart():
+    """Each is instrumented while a pause needs it, and not after that."""
+    monitor, several = pausing._monitor, [code_of('/tmp/user.py').__code__ for _ in range(2)]
+    pauses = [SimpleNamespace(ident=-1 - i) for i in range(2)]
+    assert several[0] == several[1]
+
+    def events():
+        return [bool(sys.monitoring.get_local_events(monitor._tool, code)) for code in several]
+
+    for pause, code in zip(pauses, several):
+        monitor.begin(pause, [code])
+    assert events() == [True, True]
+    monitor.end(pauses[0], several[:1])
+    assert events() == [False, True]
+    monitor.end(pauses[1], several[1:])
+    assert events() == [False, False]
+
+
+@pytest.mark.parametrize('suffix, may_pause', [('', False), ('_message_converter', True)])
+def test_callbacks_pause_in_packages_whose_names_begin_like_those_kept_out(suffix, may_pause):
+    for package in pausing._KEPT_OUT:
+        function = code_of(os.path.join(package.rstrip(os.sep) + suffix, 'module.py'))
+        assert (function.__code__ in pausing._own_code(function())) is may_pause
+
+
+class PausedHere:
+    """The calling thread as one that is to pause; the pool raises an interrupt meanwhile."""
+
+    def __init__(self, is_inside):
+        self.calls = []
+        self.ident, self.paused_ns, self.pool = threading.get_ident(), 0, self
+        self.measurement = SimpleNamespace(
+            pause=partial(self.calls.append, 'pause'), resume=partial(self.calls.append, 'resume'))
+        self.is_inside = lambda: is_inside
+
+    def overtaker(self):
+        raise KeyboardInterrupt
+
+
+@pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
+def test_an_interrupted_pause_ends():
+    thread = PausedHere(is_inside=False)
+    with pytest.raises(KeyboardInterrupt):
+        pausing.Pause(thread).take()
+    assert thread.calls == ['pause', 'resume'] and thread.paused_ns > 0
+
+
+@pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
+def test_a_thread_that_owns_the_lock_of_the_engine_does_not_pause():
+    """The finalizers of a user's objects may run there."""
+    thread = PausedHere(is_inside=True)
+    pause = pausing.Pause(thread)
+    pause.take()
+    pause.end()
+    assert thread.calls == []
+
+
 # --- callbacks that lend their workers, and go on ------------------------------------------------
 
 class Lending:
@@ -361,6 +428,23 @@ def test_others_wait_for_a_callback_that_goes_on(make_executor, make_node):
         lending.leave.set()
         assert wait_for(lambda: len(lending.ran) == 4)
     assert lending.ran == ['lends', 'goes on', 'ends', 'patient']
+
+
+def test_a_callback_that_has_lent_its_worker_is_not_short(make_executor, make_node):
+    """What waits need not wait for its end."""
+    lending, is_short = Lending(make_executor, make_node, 2, lends='50s'), []
+
+    def begins():
+        current.running.work.entity.wall_ns = 0
+        is_short.append(current.running.is_short())
+        with lending.executor.lend():
+            is_short.append(current.running.is_short())
+        is_short.append(current.running.is_short())
+
+    with Spinning(lending.executor):
+        task = lending.executor.create_task(begins)
+        assert wait_for(task.done)
+    assert is_short == [True, False, True]
 
 
 @pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')

@@ -138,6 +138,28 @@ def test_a_spin_wakes_a_worker_that_did_not_leave_after_the_last_one(make_execut
     assert task.done()
 
 
+def test_an_interrupt_while_a_spin_ends_lets_threads_wait_in_the_next_one(
+        make_executor, monkeypatch):
+    pool = make_executor()._pool
+    pool.start()
+    assert wait_for(lambda: pool.polling)
+    wake_all = pool.loop.wake_all
+
+    def wake_and_raise():
+        wake_all()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pool.loop, 'wake_all', wake_and_raise)
+        with pytest.raises(KeyboardInterrupt):
+            pool.pause()
+    assert not pool._leaving
+    for _ in range(2):
+        pool.start()
+        assert wait_for(lambda: pool.polling)
+        pool.pause()
+
+
 def test_spinning_twice_is_an_error(make_executor):
     executor = make_executor()
     assert not executor.is_spinning
