@@ -22,6 +22,7 @@ from mddag_executor.core.state import (
     PLACED,
     QueueEntry,
     READY,
+    RETURNS,
     RUNNING,
     State,
     SUSPENDED,
@@ -140,6 +141,9 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
 
 def _outer_groups(s: State) -> Iterator[str]:
     coming = {s.x_outer[first_of(s, entry)] for entry in (*s.ready, *s.held_back)}
+    for x, place in enumerate(s.x_place):
+        if place == RETURNS and s.x_outer[x] < 0:
+            yield f'execution {x} asks for a place of an outer group, and has none'
     for outer, heap in enumerate(s.outer_heap):
         placed = [x for x, place in enumerate(s.x_place)
                   if place == PLACED and s.x_outer[x] == outer]

@@ -21,6 +21,7 @@ from mddag_executor.core.state import (
     Decision,
     empty,
     fill_state,
+    NO_PLACE,
     OPEN,
     OUTER,
     State,
@@ -155,6 +156,8 @@ class Scheduler:
         elif before >= 0 and state.x_state[x] == WAITING and state.queue_place[queue] <= OUTER:
             change_key(state, queue, state.queue_key[queue])
         state.x_outer[x] = outer
+        if outer < 0:  # it asks for no place any more
+            state.x_place[x] = NO_PLACE
         if before >= 0:
             call_next(state, before)
 

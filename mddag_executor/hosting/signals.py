@@ -69,6 +69,8 @@ class Signals:
         # reentrant: a handler may interrupt its owner
         self._lock = threading.RLock()
         self._pipe: tuple[int, int] | None = None
+        # how many of the SIGINTs to come are our own
+        self._n_own = 0
 
     def __enter__(self) -> Signals:
         """Note the handlers: those that a module sets while it is imported stay."""
@@ -128,6 +130,7 @@ class Signals:
         """Let the main thread belong to a program while entered."""
         self._pipe = pipe = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         _given.append(pipe)
+        process = os.getpid()
         thread = threading.Thread(target=self._read, args=(pipe,), name='mddag-signals',
                                   daemon=True)
         thread.start()
@@ -137,9 +140,10 @@ class Signals:
                 signal.signal(signal.SIGINT, signal.default_int_handler)
             yield
         finally:
-            self.take_back()
-            _given.remove(pipe)
-            os.write(pipe[1], b'\0')  # the thread ends, and closes the pipe
+            if os.getpid() == process:  # else the pipe is that of the parent
+                self.take_back()
+                _given.remove(pipe)
+                os.write(pipe[1], b'\0')  # the thread ends, and closes the pipe
 
     def take_back(self) -> None:
         """Let SIGINT raise nothing in the main thread any more; may be called again."""
@@ -150,7 +154,9 @@ class Signals:
 
     def _read(self, pipe: tuple[int, int]) -> None:
         """Handle signals that Python has received, until a zero comes."""
-        while select.select([pipe[0]], [], []):
+        poll = select.poll()  # a descriptor may be beyond those that ``select`` knows
+        poll.register(pipe[0], select.POLLIN)
+        while poll.poll():
             with self._lock:
                 if self._drain(pipe):
                     break
@@ -163,6 +169,9 @@ class Signals:
         with suppress(BlockingIOError):
             while numbers := os.read(pipe[0], 64):
                 for number in numbers:
+                    if number == signal.SIGINT and self._n_own:
+                        self._n_own -= 1
+                        continue
                     # others have their handlers, which do it
                     if number == signal.SIGINT or number in self._before and (
                             signal.getsignal(number) != self._handle):
@@ -189,6 +198,8 @@ class Signals:
         """Raise KeyboardInterrupt in the program in the main thread, if Python's handler does."""
         if self._pipe is not None and (
                 signal.getsignal(signal.SIGINT) is signal.default_int_handler):
+            with self._lock:
+                self._n_own += 1
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
 

@@ -153,3 +153,23 @@ def test_no_more_run_than_may_and_none_is_forgotten(seed):
         assert [*broken_invariants(run.core.tables, run.state)] == []
     assert not (run.waiting or run.running)
     assert [*run.state.outer_running] == [0, 0, 0]
+
+
+def test_one_that_goes_on_may_leave_its_outer_group():
+    core = Scheduler(Tables.build(
+        None, legs=True, default_deadline=100, max_active_jobs=4, expire_after=1000), 2, 'rad')
+    first, other = core.new_outer_group(), core.new_outer_group()
+    core.open_outer(first, 1)
+    core.open_outer(other, 1)
+    x = core.ready_undeclared(0, -1, 0, core.new_queue(), 0)
+    core.state.x_outer[x] = first
+    assert core.take(0, 1) == x
+    core.lend(x)
+    core.rejoin(x, 0, 0, 2)
+    core.set_outer(x, -1)
+    assert [*broken_invariants(core.tables, core.state)] == []
+    core.go_on_without(x)
+    assert [*core.state.outer_running] == [0, 0]
+    y = core.ready_undeclared(0, -1, 0, core.new_queue(), 3)
+    core.state.x_outer[y] = other
+    assert core.take(0, 4) == y
