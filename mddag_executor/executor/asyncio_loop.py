@@ -7,11 +7,13 @@ Theory of operation
 -------------------
 1.  *One thread at a time runs asyncio code.*  asyncio's objects are not thread-safe, and worker
     threads run several coroutines at the same time.  So there is one turnstile: the thread of the
-    loop owns it except while it waits for events, and a step of a coroutine (``coroutines``) owns
-    it from its first use of the loop to its end.
-2.  *A step that does not use the loop needs no turnstile.*  ``asyncio.get_running_loop()`` returns
-    the loop in each step.  Each of its methods first lets the step join.  ``__hash__`` does so as
-    well, because ``asyncio.current_task()`` looks the task up by its loop and calls no method.
+    loop owns it except while it waits for events, and each step of a coroutine (``coroutines``)
+    owns it to its end.  Awaiting a future calls no method of the loop, so a step has to own it
+    from its start.
+2.  *Until a coroutine uses the loop, no step needs the turnstile.*  In each step
+    ``asyncio.get_running_loop()`` returns the loop.  Each of its methods lets the step join, and
+    starts the loop.  ``__hash__`` does so as well, because ``asyncio.current_task()`` looks the
+    task up by its loop and calls no method.
 3.  *The thread* starts with the first step that joins.  A step that has scheduled something wakes
     it, if it would otherwise sleep too long.  A future that is done makes the execution that
     awaits it ready at once, in the thread that has completed it.
@@ -206,6 +208,11 @@ class CallbackLoop(asyncio.SelectorEventLoop):
             self._turnstile.release()
         finally:
             stepping.is_passing = False
+
+    def join_if_it_runs(self) -> None:
+        """Let the calling thread's step run asyncio code if any step has done so before."""
+        if self._thread is not None and not self.is_closed():
+            self.join()
 
     def join(self) -> bool:
         """Let the calling thread's step run asyncio code to its end; False: there is no step."""

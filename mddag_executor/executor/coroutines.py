@@ -166,6 +166,8 @@ class Steps:
         stepping.steps = self
         asyncio._set_running_loop(self.loop)
         try:
+            if isinstance(self.loop, CallbackLoop):
+                self.loop.join_if_it_runs()
             return self._awaited(self._context.run(self._continue))
         finally:
             self.let_others()

@@ -260,6 +260,30 @@ def test_many_coroutines_sleep_at_once(make_executor):
     assert done.done() and len(threads) <= 2
 
 
+def test_steps_run_one_at_a_time_once_a_coroutine_has_used_asyncio(make_executor):
+    """Also those that call nothing of the loop: two that await one future at once would fail."""
+    executor, running, together, done = make_executor(num_workers=3), [], [], []
+
+    async def compute():
+        for _ in range(5):
+            running.append(1)
+            time.sleep(0.002)
+            together.append(len(running))
+            running.pop()
+            future = Future()
+            threading.Timer(0.001, future.set_result, (None,)).start()
+            await future
+        done.append(1)
+
+    with Spinning(executor):
+        used = executor.create_task(asyncio.sleep, 0.001)
+        assert wait_for(used.done)
+        for _ in range(6):
+            executor.create_task(compute)
+        assert wait_for(lambda: len(done) == 6)
+    assert {*together} == {1}
+
+
 class Model:
     """
     Coroutines that await futures of both kinds in a random order; how far each has to be.
