@@ -64,6 +64,12 @@ def _hop(before: Callback, after: Callback) -> Hop:
         after.reads + after.other_topics))
 
 
+def may_end(task_set: TaskSet, path: Path) -> list[bool]:
+    """Return by callback of a path but the last whether it may publish nothing for the next."""
+    return [bool(hop.topics) and hop.topics <= {*task_set.callback(key).may_publish}
+            for key, hop in zip(path.callbacks, hops(task_set, path))]
+
+
 class Segment(NamedTuple):
     """
     The callbacks of a path between two queue edges.
@@ -126,7 +132,7 @@ def sinks_after(dag: Dag, index: int) -> list[int]:
 
 
 def times_of(parts: list[Segment], what: str) -> list[int | None]:
-    """Return the times that count for a bound: T and D of each segment,."""
+    """Return the times that count for a bound: T and D of each segment."""
     times: list[int | None] = []
     for number, part in enumerate(parts):
         waits = part.period_ns

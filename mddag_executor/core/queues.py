@@ -237,7 +237,7 @@ def open_outer(s: State, outer: int, limit: int, once: int) -> None:
 
 
 def first_of(s: State, entry: QueueEntry) -> int:
-    """Return the execution that an entry stands for."""
+    """Return the first execution of the queue that an entry represents, or its own."""
     return s.queue_first[entry[4]] if entry[4] >= 0 else ~entry[4]
 
 

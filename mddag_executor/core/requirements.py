@@ -33,7 +33,7 @@ from mddag_executor.core.tally import counts, is_kept, SinkTally
 from mddag_executor.core.weakly_hard import MissWindow
 from mddag_executor.text import counted
 from msg_graph import format_duration, Path, TaskSet
-from msg_graph.segments import hops, segments
+from msg_graph.segments import may_end, segments
 
 
 class Rules:
@@ -49,9 +49,7 @@ class Rules:
         parts = segments(task_set, path)
         self.sampled = parts[0].period_ns is not None
         waits = [part.period_ns for part in parts]
-        sometimes = any(
-            hop.topics and hop.topics <= {*task_set.callback(key).may_publish}
-            for key, hop in zip(path.callbacks, hops(task_set, path)))
+        sometimes = any(may_end(task_set, path))
         self.output_every = None if None in waits or sometimes else waits[-1]
 
     def missing_outputs(self, since: int, until: int, required: int) -> int:

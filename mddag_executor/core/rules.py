@@ -57,7 +57,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     and each callback gets some time.  As long as another execution in the queue can be in time,
     the queue goes by the first one that can, and by the earliest deadline that this can meet, so
     a backlog is worked off.  In a lasting overload (``State.overloaded``) the mean execution times
-    of those before it count, too.  Age and place belong to the queue: if an execution is dropped
+    of those before it also count.  Age and place belong to the queue: if an execution is dropped
     (rule 13, or live a full queue), the queue keeps the place that the dropped one had, or is as
     late as it.  A preempted execution is checked by itself.  Running executions keep their keys.
     Only policies whose keys are times demote.  Of undeclared callbacks it is not known how long

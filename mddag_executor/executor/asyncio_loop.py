@@ -395,11 +395,12 @@ class _Bridge:
             return None
         waiter = self._loop.create_future()
         waits_for.add_done_callback(QuickCallback(partial(
-            self._loop.call_soon_threadsafe, _set_done, waiter)))
+            self._loop.call_soon_threadsafe, set_done, waiter)))
         waiter._asyncio_future_blocking = True
         return waiter
 
 
-def _set_done(waiter: asyncio.Future[None]) -> None:
+def set_done(waiter: asyncio.Future[None]) -> None:
+    """Complete a future, unless it has been cancelled or completed."""
     if not waiter.done():
         waiter.set_result(None)

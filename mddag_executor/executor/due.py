@@ -8,7 +8,7 @@ Theory of operation
 1.  *Due times* are those of timers, deadlines of open jobs, checks, and calls.  While a thread
     waits in the epoll, its timerfd (``EventLoop.timer``) is set to the earliest.  While there are
     executions to run, it may expire too early, but not too late.
-2.  *Looks.*  Waking a thread costs 60 to 140 us while a callback computes, so nobody waits for
+2.  *Looks.*  Waking a thread costs 60 to 140 us while a callback computes, so no thread waits for
     events then.  A parked thread *looks* instead, at the latest time at which anything that may
     have come would have to start (``Parking.watch``).  A callback that is known to wait has to
     start at once.  One that computes may wait for a part of its relative deadline

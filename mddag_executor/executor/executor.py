@@ -102,12 +102,6 @@ def deadline_of(timeout_sec: float | None) -> float | None:
     return time.monotonic() + timeout_sec
 
 
-def _set_done(future: Any) -> None:
-    """Complete a future of asyncio."""
-    if not future.done():
-        future.set_result(None)
-
-
 class MultiDeadlineExecutor(BareExecutor):
     """
     Run callbacks in the order of their deadlines, on a bounded pool of workers.
@@ -741,10 +735,11 @@ class MultiDeadlineExecutor(BareExecutor):
 
     async def _readable(self, loop: AbstractEventLoop) -> None:
         """Let the event loop run until there is an arrival or a due time."""
+        from mddag_executor.executor.asyncio_loop import set_done  # with asyncio
         fd, event = self._stepping_epoll().fileno(), loop.create_future()
-        loop.add_reader(fd, _set_done, event)
+        loop.add_reader(fd, set_done, event)
         left = self._patience_s(None, self._upkeep.rest_s())
-        timer = None if left is None else loop.call_later(left, _set_done, event)
+        timer = None if left is None else loop.call_later(left, set_done, event)
         try:
             await event
         finally:

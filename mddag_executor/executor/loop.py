@@ -201,16 +201,21 @@ class EventLoop:
         self._bell = self._leave = self._epoll_fd = -1
         self._free.clear()
         self.wait = self.poll = lambda *_: []
-        for fd in fds:
-            if fd >= 0:
-                os.close(fd)
-        for name in ('timer', '_epoll'):
-            if hasattr(self, name):  # else it could not be opened
-                getattr(self, name).close()
+        _close(self, fds, ('timer', '_epoll'))
 
     def __del__(self) -> None:
         """Close the descriptors of an executor that was never shut down."""
         self.close()
+
+
+def _close(owner: object, fds: Iterable[int], names: Iterable[str]) -> None:
+    """Close descriptors, and what an owner has by these names, as far as it could be opened."""
+    for fd in fds:
+        if fd >= 0:
+            os.close(fd)
+    for name in names:
+        if hasattr(owner, name):
+            getattr(owner, name).close()
 
 
 class Parking:
@@ -249,12 +254,7 @@ class Parking:
         """Close all descriptors, once; no thread waits any more."""
         fds = self._bell, self._end
         self._bell = self._end = -1
-        for fd in fds:
-            if fd >= 0:
-                os.close(fd)
-        for name in ('watch', '_epoll'):
-            if hasattr(self, name):  # else it could not be opened
-                getattr(self, name).close()
+        _close(self, fds, ('watch', '_epoll'))
 
     def __del__(self) -> None:
         """Close the descriptors of an executor that was never shut down."""

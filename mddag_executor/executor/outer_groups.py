@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def outer_here() -> int:
-    """Return the outer group of the calling callback, or -1: its tasks belong to that, too."""
+    """Return the outer group of the calling callback, and so of its tasks; -1: none."""
     running = current.running
     work = None if running is None else running.work
     return -1 if work is None else work.entity.outer

@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.core.requirements import RequirementTally, Rules
 from msg_graph import Path, TaskSet
-from msg_graph.segments import hops
+from msg_graph.segments import Hop, hops, may_end
 
 _KEEP_RESPONSES = 2_000
 _REMEMBERED = 256
@@ -169,12 +169,10 @@ class _Path:
     def __init__(self, task_set: TaskSet, path: Path) -> None:
         self.name = path.name
         self._hops = hops(task_set, path)
-        self._may_end = [
-            bool(hop.topics) and hop.topics <= {*task_set.callback(key).may_publish}
-            for key, hop in zip(path.callbacks, self._hops)]
+        self._may_end = may_end(task_set, path)
         self.topics = frozenset().union(
             *(hop.topics for hop in self._hops if hop.kind == 'topic'))
-        self._state = _State(task_set, path, self._may_end)
+        self._state = _State(task_set, path, self._hops, self._may_end)
         self.positions = self._state.positions
         self.open: dict[Hashable, int] = {}
         self._events: list[_Event] = []
@@ -243,7 +241,9 @@ class _Path:
 class _State:
     """The flows of a path and their results up to a time."""
 
-    def __init__(self, task_set: TaskSet, path: Path, may_end: list[bool]) -> None:
+    def __init__(
+        self, task_set: TaskSet, path: Path, path_hops: list[Hop], may_end_at: list[bool],
+    ) -> None:
         self._rules = Rules(task_set, path)
         self._last = len(path.callbacks) - 1
         place = {key: position for position, key in enumerate(path.callbacks)}
@@ -258,11 +258,11 @@ class _State:
             self._before[vertex] = [
                 first + local for local in each.predecessors if position
                 and task_set.vertices[first + local].callback.key == path.callbacks[position - 1]]
-        self._kinds = [hop.kind for hop in hops(task_set, path)]
+        self._kinds = [hop.kind for hop in path_hops]
         self._is_sync = [task_set.callback(key).kind == 'sync' for key in path.callbacks]
         # by vertex and job the input that its execution had
         self._inputs: dict[int, dict[int, int]] = {vertex: {} for vertex in self.positions}
-        self._may_end = may_end
+        self._may_end = may_end_at
         # by position of a queue edge the number and the input of the latest value
         self._latest: list[tuple[int, int | None]] = [(0, None) for _ in path.callbacks]
         # inputs, and the changes that they will have seen, that are not answered yet

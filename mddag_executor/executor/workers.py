@@ -10,12 +10,12 @@ Theory of operation
     (``loop``).  When it wakes, it collects the arrivals and asks again.  The kernel wakes exactly
     one thread for each event.
 2.  *Who waits for events.*  As a rule one thread (``ThreadState.WAITING``); all others are
-    *parked*.  While a callback computes, nobody does: the thread that runs it goes on with what
+    *parked*.  While a callback computes, no thread waits: the one that runs it goes on with what
     comes first when it ends, and a parked one *looks* now and then (``due``).  If anything may
     start then, because it is urgent or waits, that thread runs it.  So callbacks that compute are
     run by one thread, one after the other, and no other thread is woken in vain.  A callback that
     is known to wait (for a server, a disk, a sleep) leaves the events to another thread.  While
-    messages or requests may come for such a callback (``Entity.is_eager``), somebody always waits.
+    messages or requests may come for such a callback (``Entity.is_eager``), a thread always waits.
 3.  *No event is overlooked.*  When no thread waits in the epoll, a thread that has more to run
     polls it first, every ``SHORT_CALLBACK_NS``.  So an urgent arrival is known before the next
     choice.
@@ -127,7 +127,7 @@ class WorkerThread:
 
     :ivar work: the running execution.
     :ivar worker: the number of its last worker in the core.
-    :ivar state: what it does; ``WorkerPool.become`` changes it.
+    :ivar state: what it does; only the pool changes it.
     :ivar permit: a lock, released to let its callback go on.
     :ivar has_lent: whether its callback has returned its worker at any time; ``is_out``: whether
         it has none now; ``waits``: whether it still waits for what it lent its worker for.

@@ -69,7 +69,7 @@ from mddag_executor.recording.tables import (
 )
 from mddag_executor.replay.spread import spread
 from msg_graph import Callback, Path
-from msg_graph.segments import hops
+from msg_graph.segments import hops, may_end
 import numpy as np
 
 NONE = -1
@@ -280,9 +280,7 @@ class Paths:
 
     def may_end(self, number: int) -> Mask:
         """Return by position of a path whether a flow may end there, as nothing is published."""
-        return np.array([
-            bool(hop.topics) and hop.topics <= {*self._task_set.callback(key).may_publish}
-            for key, hop in zip(self.paths[number].callbacks, self.hops[number])] + [False])
+        return np.array([*may_end(self._task_set, self.paths[number]), False])
 
     def steps(self, number: int) -> Table:
         """Return the steps of a path, a table of ``STEPS``."""

@@ -18,28 +18,11 @@ from msg_graph import load
 import pytest
 
 from ..conftest import run_program, wait_for_run
+from ..declared_path import imu_to_wheels
 from . import golden
 from .declared import GRAPH
 
-SENSED = """\
-mddag: 1
-workers: 2
-nodes:
-  - node: /imu
-    callbacks:
-      - {name: sample, timer: 10ms, publishes: [/imu], execution_time: 1ms}
-  - node: /fuse
-    callbacks:
-      - {name: on_imu, subscription: /imu, deadline: 10ms, execution_time: 1ms}
-      - {name: estimate, timer: 20ms, reads: [on_imu], publishes: [/pose], execution_time: 2ms}
-  - node: /wheels
-    callbacks: [{name: drive, subscription: /pose, deadline: 20ms, execution_time: 1ms}]
-paths:
-  - name: imu_to_wheels
-    callbacks: ['/imu:sample', '/fuse:on_imu', '/fuse:estimate', '/wheels:drive']
-    reaction: 40ms
-    age: 20ms
-"""
+SENSED = imu_to_wheels(reaction='40ms', age='20ms')
 
 
 def test_a_run_judges_paths_as_its_replay_does(folder, mddag):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What ordinary robots do: publish sometimes, store values, start once, wait for a button."""
 
+from contextlib import contextmanager
 from functools import partial
 from itertools import count
 import time
@@ -40,26 +41,37 @@ def verdicts(result):
             for dag in result['dags'].values() for name, sink in dag['sinks'].items()}
 
 
-def test_results_that_nothing_was_published_for_are_not_due(make_executor, make_node, tmp_path):
-    """They are no misses, live, as recorded and rescheduled; a silent job ends at once."""
-    path = tmp_path / 'run.mcap'
-    started = []
+@contextmanager
+def run_robot(make_executor, make_node, text, path, start=lambda: None):
+    """
+    Record 30 jobs of the robot; give it and its executor, which spins still and is idle.
 
-    def start():
-        started.append(1)
+    :param start: called by the callback that runs once, which cancels its timer then.
+    """
+    def start_once():
+        start()
         robot.timers[1].cancel()
 
-    robot = Declared(make_node, ROBOT, {'detect': detect, 'start': start})
-    executor = make_executor(loads(ROBOT), num_workers=3, trace=str(path))
+    robot = Declared(make_node, ROBOT, {'detect': detect, 'start': start_once})
+    executor = make_executor(loads(text), num_workers=3, trace=str(path))
     with Spinning(executor):
         robot.start(executor)
         assert wait_for(lambda: len(robot.ran['detect']) >= 30)
         robot.cancel()
         assert wait_for(lambda: is_idle(executor))
+        yield robot, executor
+    executor.shutdown()
+
+
+def test_results_that_nothing_was_published_for_are_not_due(make_executor, make_node, tmp_path):
+    """They are no misses, live, as recorded and rescheduled; a silent job ends at once."""
+    path = tmp_path / 'run.mcap'
+    started = []
+    with run_robot(make_executor, make_node, ROBOT, path, partial(started.append, 1)) as (
+            robot, executor):
         ends = executor.statistics()['dags']['vision']['ends']
         # no job waits for a message that does not come
         assert sum(ends.values()) == executor.statistics()['dags']['vision']['jobs']
-    executor.shutdown()
     statistics = executor.statistics()
     jobs = [job.job for job in robot.jobs('detect')]
     found = sum(job % FINDS_IN == 0 for job in jobs)
@@ -88,15 +100,8 @@ def test_the_draft_of_a_recording_knows_what_is_published_sometimes(
         make_executor, make_node, tmp_path, text):
     """Its verdict on the same recording has no miss, and keys that were declared stay."""
     path = tmp_path / 'run.mcap'
-    robot = Declared(make_node, ROBOT, {
-        'detect': detect, 'start': lambda: robot.timers[1].cancel()})
-    executor = make_executor(loads(text), num_workers=3, trace=str(path))
-    with Spinning(executor):
-        robot.start(executor)
-        assert wait_for(lambda: len(robot.ran['detect']) >= 30)
-        robot.cancel()
-        assert wait_for(lambda: is_idle(executor))
-    executor.shutdown()
+    with run_robot(make_executor, make_node, text, path):
+        pass
     drafted = loads(declaration_of(System(path).draft(), accepted=True))
     found = {callback.name: callback for callback in drafted.callbacks}
     assert found['detect'].publishes == ('/seen', '/alarm')

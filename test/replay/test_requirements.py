@@ -20,30 +20,12 @@ from msg_graph.segments import bound, segments
 import numpy as np
 import pytest
 
+from ..declared_path import imu_to_wheels
 from .helpers import MS
 from .path_systems import random_system, simulated_run
 from .told import Told
 
-GRAPH = """\
-mddag: 1
-workers: 2
-nodes:
-  - node: /imu
-    callbacks:
-      - {name: sample, timer: 10ms, publishes: [/imu], execution_time: 1ms}
-  - node: /fuse
-    callbacks:
-      - {name: on_imu, subscription: /imu, deadline: 10ms, execution_time: 1ms}
-      - {name: estimate, timer: 20ms, reads: [on_imu], publishes: [/pose], execution_time: 2ms}
-  - node: /wheels
-    callbacks:
-      - {name: drive, subscription: /pose, deadline: 20ms, execution_time: 1ms}
-paths:
-  - name: imu_to_wheels
-    callbacks: ['/imu:sample', '/fuse:on_imu', '/fuse:estimate', '/wheels:drive']
-    reaction: 30ms
-    age: 13ms
-"""
+GRAPH = imu_to_wheels(reaction='30ms', age='13ms')
 
 
 def counts(result):
