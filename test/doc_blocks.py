@@ -11,7 +11,7 @@ sourced workspace.  Its blocks are tried there in the order of the page, so that
 one before it has made.  What is done with a block depends on its language:
 
 * `sh`: run by bash, which must end with status 0; `mddag` and `python` are those of this test.
-* `text` right behind: the output of that command.  `…` in it matches anything.
+* `text` right after it: the output of that command.  `…` in it matches anything.
 * `python`: run as a program.
 * `yaml`: a declaration, which must load.
 
@@ -21,6 +21,8 @@ Comments (HTML, invisible on the page) right before a block change that:
   all files of the page are there).
 * `<!-- exit: N -->`: it ends with this status.
 * `<!-- in the test: A => B -->`: B is tried in place of A, to be quick.
+* `<!-- measured -->`: an output that differs from run to run: a number stands for any number, and
+  a table may have further columns.
 * `<!-- not run: REASON -->`: it is not run, for one of ``REASONS``; what can be checked without
   running it is: Python must compile, YAML must parse, options of `mddag` must exist.
 """
@@ -42,7 +44,8 @@ _BLOCK = re.compile(
     r'(?P<marks>(?:^[ ]*<!-- [^\n]* -->\n+)*)'
     r'^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$',
     re.MULTILINE | re.DOTALL)
-_MARK = re.compile(r'<!-- (file|exit|in the test|not run): (.*?) -->')
+_MARK = re.compile(r'<!-- (file|exit|in the test|not run|measured)(?:: (.*?))? -->')
+_NUMBER = re.compile(r'-?\d[\d,]*(?:\.\d+)?')
 _TIMEOUT_S = 150.0  # of a command that takes 10 s on an idle machine
 
 
@@ -158,7 +161,7 @@ class Folder:
             self.write('example.py', block.to_try)
             return self._run(block, [sys.executable, 'example.py'])
         elif block.language == 'text' and name is None:
-            expected = re.escape(block.text.rstrip()).replace('…', '.*?')
+            expected = self._expected(block)
             actual = '\n'.join(line.rstrip() for line in self.output.rstrip().splitlines())
             assert re.fullmatch(expected, actual, re.DOTALL), (
                 f'{block.place}: the output is not\n{block.text}\nbut\n{actual}')
@@ -177,6 +180,17 @@ class Folder:
         else:
             assert reason is not None, (
                 f'{block.place}: {block.language!r} cannot be tried: mark it')
+
+    @staticmethod
+    def _expected(block):
+        """Return the regular expression of the output that a block shows."""
+        text = block.text.rstrip()
+        if block.mark('measured') is None:
+            return re.escape(text).replace('…', '.*?')
+        text = re.sub(r'(?<=#) (?:ns|us|ms|s)\b', ' UNIT', _NUMBER.sub('#', text))
+        expected = re.escape(text).replace('…', '.*?')
+        expected = re.sub(r'(\\ ){2,}', r' [^\\n]*?', expected).replace(r'\ ', ' +')
+        return expected.replace(r'\#', _NUMBER.pattern).replace('UNIT', '(?:ns|us|ms|s)')
 
     def _run(self, block, command):
         expected = int(block.mark('exit') or 0)
