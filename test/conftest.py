@@ -5,8 +5,8 @@ What all tests share: a ROS domain of their own, an order, and guards against le
 
 Every session (and every worker of pytest-xdist) claims a ROS domain that no other session on this
 machine has, and discovery stays on this machine, so tests neither hear a robot nor disturb one.
-Each has a folder for temporary files, too, which has to be empty at its end; by this folder in
-their environment its processes are known, of which none may be left.
+Each also has a folder for temporary files, which has to be empty at its end. This folder is in the
+environment of the test's processes, so that they can be found: none of them may still be running.
 
 A test marked `needs('graphviz')` is skipped where `.ci/tools` misses that program, and the last
 line says so. With CI in the environment nothing may be missing: such a test fails, and so does a
@@ -75,7 +75,7 @@ def pytest_configure(config):
         signal.signal(signal.SIGINT, signal.default_int_handler)
     # What pytest itself keeps stays where it is.
     os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', tempfile.gettempdir())
-    os.environ.setdefault('MDDAG_DEBUG', 'engine')  # of programs that tests start, too
+    os.environ.setdefault('MDDAG_DEBUG', 'engine')  # programs that tests start inherit it
     tempfile.tempdir = _session.enter_context(
         tempfile.TemporaryDirectory(prefix='mddag-test-', ignore_cleanup_errors=True))
     os.environ.pop('ROS_STATIC_PEERS', None)
@@ -243,7 +243,7 @@ def no_thread_leak():
             frames = sys._current_frames()
             where = [f'{thread!r}\n' + ''.join(traceback.format_stack(frames[thread.ident]))
                      for thread in left if thread.ident in frames]
-            pytest.fail('threads left behind:\n' + '\n'.join(where), pytrace=False)
+            pytest.fail('threads still run:\n' + '\n'.join(where), pytrace=False)
         time.sleep(0.01)
 
 

@@ -111,7 +111,7 @@ class Folder:
     The folder in which the blocks of one page are tried.
 
     :param path: an empty folder.
-    :param files: further files that the page takes for granted.
+    :param files: further files that the page uses and does not show.
     """
 
     def __init__(self, path, files=None):

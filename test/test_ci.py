@@ -83,7 +83,7 @@ def is_tagged():
 
 
 def placeholders():
-    """Return the files that have an address at example.com, which is nobody's."""
+    """Return the files that have an address at example.com, which belongs to no one."""
     done = subprocess.run(
         ['git', 'grep', '-lI', r'example\.com', '--', ':!test/test_ci.py', ':!docs/release.md'],
         cwd=TOP, text=True, capture_output=True, check=False)

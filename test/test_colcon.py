@@ -143,7 +143,7 @@ def test_a_signal_ends_ros2_launch_and_the_run(workspace, tmp_path, number, to_a
             os.killpg(process.pid, number)
         else:
             process.send_signal(number)
-        said = process.stdout.read()    # to its end: the run has it, too
+        said = process.stdout.read()    # to its end: the run has it as well
     while Path(f'/proc/{pid}').exists():
         time.sleep(0.05)
     if number == signal.SIGINT:

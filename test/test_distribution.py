@@ -119,7 +119,7 @@ def test_the_executor_loads_little_besides_rclpy():
 
 @pytest.fixture(scope='module')
 def built(tmp_path_factory):
-    """Build a source distribution, and from what is in it a wheel, as pip does."""
+    """Build a source distribution, and a wheel from its contents, as pip does."""
     place = tmp_path_factory.mktemp('built')
     files = subprocess.run(
         ['git', 'ls-files', '--cached', '--others', '--exclude-standard'], cwd=TOP,

@@ -99,7 +99,7 @@ CIRCLES = {
 
 
 def circles(folder):
-    """Return the files of a folder that import each other in a circle, also for type checkers."""
+    """Return the files of a folder that import each other in a circle, if only for type checks."""
     files = {path.stem for path in folder.glob('*.py')} - {'__init__'}
     package = '.'.join(folder.relative_to(TOP).parts)
     seen = {}

@@ -167,7 +167,7 @@ def releases():
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_run_also_if_it_comes_twice(graph, number):
-    """Who ends a process group sends one, and `ros2 launch` sends its own, too."""
+    """A shell signals the whole process group, and `ros2 launch` sends a signal of its own."""
     with started(graph) as process:
         # The window begins after the warm-up of 1 s.
         wait_for_run(process, lambda: max(found := releases() or [0]) - found[0] > 2 * 10 ** 9)

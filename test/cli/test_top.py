@@ -94,7 +94,7 @@ def test_every_sink_has_a_line_in_every_terminal(width, processes):
     n_sinks = sum(len(dag.sinks) for dag in load(CONFIG / 'autoware.yaml').dags)
     assert lines.index('') == 1 + n_sinks * len(processes)
     assert ('process' in titles) == (len(processes) > 1)
-    # the worst one is the first, with what is wrong if there is room for it
+    # the worst one is the first; its faults are named if there is room for them
     assert 'ERROR' in first and '20 %' in first and 'alidator:callback_2' in first or width == 60
     if width >= 80:
         assert '393 ms' in first and '300 ms' in first

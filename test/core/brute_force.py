@@ -3,39 +3,43 @@
 """
 A second simulator, slow and plain, to compare the core with.
 
-Written from the project's documents (the model, its rules, and what the paper's own program does
-exactly), not from the core, with which it shares no code: it goes tick by tick through time, keeps
-what waits in an unsorted list and looks everything up again each time.
+It was written from the project's documents (the model, its rules, and the behaviour of the paper's
+own program), not from the core, with which it shares no code.  It goes tick by tick through time,
+keeps all waiting executions in one unsorted list, and computes everything again each time.
 
 Its reading of the documents:
 
-* At one instant completions come first, workers in ascending order, each making its successors
-  ready, the last listed first; then releases in DAG order; then work is handed out, one by one, as
-  long as there is anything to hand out. Work is handed out only at instants at which something
-  happened. What is preempted queues up again, behind all that is there.
-* A DAG with ``max_active_jobs`` open jobs loses the oldest when one more is released: it expires.
-  What it has ready or running goes on, without consequences.
-* What waits at a vertex and has never run is its queue. The first by key of these is its head, and
-  runs first. The queue has a place among all that waits: the least key of those that have been in
-  it since one of it ran last, also of those that vanished.
-* ``demote`` (``rad``, ``gedf``, ``llf``): if the head would start next, and is late for a deadline
-  that it leads to, if every vertex on the longest way takes its mean time, then the queue gets the
-  place of the first in it that can be in time, by its deadlines within reach (``rad``, ``llf``).
-  If the mean times of all vertices need more than the workers, those before it in the queue take
-  their time, too. If there is none, the queue goes as if the job of its head were released ten
-  relative deadlines later, until one of it runs; as do the later vertices of that job. An
-  execution that was preempted is a queue by itself.
-* ``keep: newest`` at a source or sink: of two in a queue the one of the earlier job vanishes. So
-  does one of a timer that cannot make any deadline that it leads to any more, with ``demote``,
-  when a later one is ready. If one vanishes that is late, its queue is as late as it.
-* ``ros2`` goes by rounds. When a worker is free and the round has nothing left that it could take,
-  the next round is, of all that waits, the first of each callback. The worker goes through it by
-  kind (timers, subscriptions and syncs, services), then by the callback's place in the file, and
-  leaves out, for the round, what is blocked when its turn comes. A round of which all is blocked
-  ends the search until something happens again.
+* At one instant, completions are handled first, by ascending number of the worker.  Each of them
+  makes its successors ready, the last one in the list first.  Then releases are handled, in the
+  order of the DAGs.  Then executions are started, one by one, as long as one can be started.
+  Executions start only at instants at which something happened.  A preempted execution goes to the
+  end of the list.
+* If a job is released while ``max_active_jobs`` jobs of its DAG are open, the oldest of these
+  expires.  Its executions that are ready or running go on, without consequences.
+* The executions that wait at a vertex and have never run are the queue of the vertex.  The one
+  with the smallest key is the head of the queue, and runs first.  The queue has a place among
+  everything that waits: the smallest key of all executions that have been in the queue since one
+  of it ran last.  Executions that were dropped since then count as well.
+* ``demote`` (``rad``, ``gedf``, ``llf``): suppose that the head would start next, that every
+  vertex on the longest path takes its mean time, and that the head is then late for a deadline
+  that it leads to.  Then the queue gets the place of its first execution that can be in time, with
+  the deadlines that this one can meet (``rad``, ``llf``). If the mean times of all vertices
+  together need more than the workers, the executions before it in the queue take their time as
+  well.  If no execution can be in time, the queue is ordered as if the job of its head were
+  released ten relative deadlines later, until one of its executions runs; so are the later
+  vertices of that job.  A preempted execution is a queue by itself.
+* ``keep: newest`` at a source or sink: of two executions in a queue, the one of the earlier job is
+  dropped.  With ``demote``, an execution of a timer that can make none of the deadlines that it
+  leads to is dropped when a later one becomes ready.  If a late execution is dropped, its queue
+  stays late by the same time.
+* ``ros2`` goes by rounds.  When a worker is free and the round has no execution left that it could
+  start, the next round begins: the first waiting execution of each callback.  The worker goes
+  through the round by kind (timers, subscriptions and syncs, services), then by the callback's
+  place in the file.  It leaves an execution out of the round if the execution is blocked when its
+  turn comes.  If all executions of a round are blocked, the search ends until something happens.
 * ``picas``: a vertex belongs to the path to the sink with the least deadline that it leads to.
-  Paths go by that deadline, the period and the DAG's index; on one path what is later goes first.
-  A callback with several vertices has the priority of the first of them.
+  Paths are ordered by that deadline, the period and the index of the DAG; on one path, later
+  vertices go first.  A callback with several vertices has the priority of the first of them.
 """
 
 from dataclasses import dataclass, field
@@ -91,7 +95,7 @@ class Job:
     done: set[int] = field(default_factory=set)
     outcome: str | None = None
     late: bool = False
-    demoted: int | None = None  # the release that counts from then on, ns
+    demoted: int | None = None  # the release that counts after that, ns
 
 
 @dataclass(eq=False)

@@ -61,7 +61,7 @@ class Case:
 
 
 def declaration(callbacks):
-    """Derive callbacks that each name their node; they stand in the file in this order."""
+    """Derive callbacks that each name their node; the file lists them in this order."""
     nodes = [{'node': callback['node'],
               'callbacks': [{k: v for k, v in callback.items() if k != 'node'}]}
              for callback in callbacks]

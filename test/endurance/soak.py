@@ -348,7 +348,7 @@ class Soak:
         self._simulated.stop()
         self.nodes.workload.destroy()
         stalls = self._stalls.stop()
-        # what is released last in a window runs on beyond it, and may wait for what was before
+        # the last jobs of a window run on beyond it, and may wait for work from before
         judged = [(start, stop) for start, stop, _ in self._clean if not any(
             start - 500_000_000 <= stall < stop + 200_000_000 for stall in stalls)]
         self._sort_out()

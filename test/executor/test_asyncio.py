@@ -176,7 +176,7 @@ def test_the_coroutine_of_a_callback_is_the_current_task(make_executor, until_do
 
 
 def test_a_cancelled_callback_ends_without_an_error(make_executor, make_node, until_done):
-    """A task of rclpy is cancelled then; those that nobody cancelled fail."""
+    """A task of rclpy is cancelled then; a callback that was not cancelled fails."""
     done, node = Future(), make_node()
 
     async def cancel_itself():
@@ -209,7 +209,7 @@ def test_a_cancelled_callback_ends_without_an_error(make_executor, make_node, un
 
 
 def test_groups_and_jobs_are_kept_while_a_callback_sleeps(make_executor, make_node, tmp_path):
-    """A mutually exclusive group stays with it; it goes on for its job, also in a recording."""
+    """It keeps its mutually exclusive group, and continues for its job; a recording agrees."""
     node, jobs, running, overlaps = make_node('n'), [], set(), []
     publisher = node.create_publisher(Header, '/a', 10)
 
@@ -396,7 +396,7 @@ def begun(executor):
 
 
 def test_a_coroutine_may_fail_when_it_is_cancelled_at_the_end(ros_context, make_node, capfd):
-    """The others are cancelled, too, and the run is judged."""
+    """The others are cancelled as well, and the run is judged."""
     ended = []
 
     async def fail():

@@ -129,7 +129,7 @@ def test_ready_callbacks_run_in_the_policys_order(make_executor, make_node, poli
 
 
 def test_a_lost_message_expires_its_job(make_executor, make_node):
-    """Nobody runs the relay: its jobs cannot complete, expire, and free their places."""
+    """The relay does not run: its jobs cannot complete, expire, and free their places."""
     chain = Declared(make_node, CHAIN)
     chain.nodes['middle'].destroy_subscription(next(iter(chain.nodes['middle'].subscriptions)))
     executor = make_executor(
@@ -200,7 +200,7 @@ def agrees(trace, statistics):
     again = reschedule(trace).result()
     for name, dag in statistics['dags'].items():
         assert result['dags'][name]['ends'] == dag['ends']
-        # Rescheduled, skipped releases run, too, and the last ones may not get to an end.
+        # Rescheduled, skipped releases run as well, and the last ones may not get to an end.
         assert 0 < again['dags'][name]['ends']['failed'] <= dag['ends']['failed']
         for sink, counts in dag['sinks'].items():
             found = result['dags'][name]['sinks'][sink]

@@ -117,7 +117,7 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
     with Spinning(executor):
         matched(publisher, count=2)
         with subprocess.Popen([sys.executable, '-c', FOREIGN]) as foreign:
-            assert wait_for(lambda: 'foreign:200' in got)  # its numbers are larger from then on
+            assert wait_for(lambda: 'foreign:200' in got)  # after that, its numbers are larger
             timer.reset()
             executor.wake()
             for number in itertools.count():

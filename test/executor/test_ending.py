@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What frees the threads and descriptors of an executor, also if nobody shuts it down."""
+"""An executor gives back its threads and descriptors, even if it is not shut down."""
 
 import gc
 import os
@@ -48,7 +48,7 @@ def run(executor, node):
             executor.spin_once(0.05)
 
 
-# --- nobody shuts it down ------------------------------------------------------------------------
+# --- it is not shut down -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize('has_spun', [False, True])

@@ -159,7 +159,7 @@ class OneUser:
 
 @pytest.mark.parametrize(('on_late', 'dropped'), [('demote', 4), ('continue', 1)])
 def test_late_messages_of_a_full_queue_are_dropped_with_the_oldest(on_late, dropped):
-    """Else all that follow wait for as many periods as it is long, and are late, too."""
+    """Otherwise all that follow wait for as many periods as it is long, and are late as well."""
     one = OneUser(depth=4, on_late=on_late)
     times = range(0, 2500 * MS, 500 * MS)
     origins = [one.publish(time) for time in times]
@@ -280,7 +280,7 @@ def flooded(depths, tick_ms=2):
 @pytest.mark.parametrize('depths', [(1,), (10,), (1000,), (10, 10, 1)])
 def test_an_undeclared_overload_takes_no_declared_deadline_down(depths):
     tick, ran = flooded(depths)
-    assert counts(tick).in_time >= 98  # of 100; at first, all messages can be in time, too
+    assert counts(tick).in_time >= 98  # of 100; at first, all messages can be in time as well
     assert 480 <= sum(map(len, ran)) <= 500  # all the time that the timer leaves
     for each in ran:
         assert [number for number, _ in each] == sorted(number for number, _ in each)
@@ -336,7 +336,7 @@ def test_messages_without_a_job_keep_their_order_behind_a_late_one(policy):
 
 
 def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_more():
-    """The first one is held back: another callback has the GIL."""
+    """The first one has to wait, because another callback has the GIL."""
     engine, user = new_engine(workers=2), new_entity(holds=True)
     other = Work(new_entity(holds=True), print)
     engine.ready(other, 0)
@@ -567,7 +567,7 @@ def busy_engine():
     """
     Return an engine in which something of each kind is under way.
 
-    One of group 0 runs and one waits for it; one holds the GIL and one is held back; one is
+    One of group 0 runs and one waits for it; one holds the GIL and one waits for it; one is
     suspended; and a job of a DAG is ready.
     """
     twin = Steps('rad', 4)

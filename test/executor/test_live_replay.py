@@ -51,7 +51,7 @@ async def rectify():
 
 
 def test_entities_may_come_and_go_while_recorded(make_executor, make_node, tmp_path):
-    """A new one often gets the address of an earlier one: it is not taken for that."""
+    """A new one often gets the address of an earlier one: they are not confused."""
     text = graph(
         a="""
             name: step, timer: 10ms, publishes: [/left]

@@ -235,7 +235,7 @@ def test_an_exception_that_is_handled_does_not_end_the_executor(make_executor):
 @pytest.mark.usefixtures('each_rclpy')
 @pytest.mark.parametrize('steps', [False, True])
 def test_a_spin_that_waits_for_a_task_raises_its_exception(make_executor, steps):
-    """Once, also if the maker of the task still runs; a later spin is not disturbed by it."""
+    """Once, even if the maker of the task still runs; a later spin is not disturbed by it."""
     executor = make_executor()
     goes_on, made = Future(executor=executor), []
 

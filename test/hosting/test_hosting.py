@@ -362,7 +362,7 @@ def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag):
     done = mddag('run', 'graph.yaml', '--node', 'chat:exits_early', '--trace', 'out.mcap')
     assert (done.returncode, done.stderr.count('\n')) == (5, 1), done.stderr
     assert not Path('out.mcap').exists()
-    Path('null').symlink_to('/dev/null')    # a device stays, also if root names it
+    Path('null').symlink_to('/dev/null')    # a device stays, even if root names it
     done = mddag('run', 'graph.yaml', '--node', 'chat:exits_early', '--trace', 'null')
     assert done.returncode == 5
     assert Path('null').is_symlink()

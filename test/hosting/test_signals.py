@@ -43,7 +43,7 @@ with signals:
             time.sleep(10)
         except KeyboardInterrupt:
             pass
-        assert until(lambda: session.stopped), 'nobody reads the signals any more'
+        assert until(lambda: session.stopped), 'no thread reads the signals any more'
 os._exit(0)
 """
 

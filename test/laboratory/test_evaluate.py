@@ -148,7 +148,7 @@ def same(first, second):
 
 
 def test_several_task_sets(small):
-    """Each has its own draws and workers; chunks may reach over several; processes, too."""
+    """Each has its own draws and workers; chunks and processes may have parts of several."""
     base = Experiment(small, ('rad', 'fifo'), workers=1, duration_ns=200_000_000, seed=1)
     other = loads(SMALL.replace('2500us', '4500us'), 'other.yaml')
     experiments = (base, replace(base, workers=2), replace(base, task_set=other))

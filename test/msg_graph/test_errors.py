@@ -36,7 +36,7 @@ def of_everything(case):
     right, wrong = json.loads(case)
     assert right in EVERYTHING
     text = EVERYTHING.replace(right, wrong, 1)
-    refused = ['> the schema refuses it, too'] if schema_errors(text) else []
+    refused = ['> the schema refuses it as well'] if schema_errors(text) else []
     return errors_of(loads, text, 'g.yaml') + refused
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Damaged declarations give an error of one line; the work grows with what is declared."""
+"""Damaged declarations give an error of one line; the work grows with their contents."""
 
 import sys
 

@@ -92,7 +92,7 @@ def test_text_is_a_time_or_a_duration_error(text):
     (0, '0ns', '0ns'), (1, '1ns', '1ns'), (999, '999ns', '999ns'), (1_000, '1us', '1us'),
     (1_001, '1.001us', '1.001us'), (100_000_000, '100ms', '100ms'), (DAY, '86400s', '86400s'),
     (1_234_567, '1.235ms', '1234.567us'), (1_234_000, '1.234ms', '1.234ms'),
-    # What no declaration can say has a text, too: the reader of the text says what is wrong.
+    # Times that no declaration can have are texts as well: the reader says what is wrong.
     (-1_500_000, '-1.5ms', '-1500000ns'), (DAY + 1, '86400s', f'{DAY + 1}ns'),
     (2**63 - 1, '9223372036.855s', f'{2**63 - 1}ns')])
 def test_formats_times(ns, shown, exact):

@@ -42,7 +42,7 @@ def slow_cases(records):
     ends = {}
     for start in {row[0] for row in rows}:
         own = [end for first, end in rows if first == start and end is not None]
-        # what comes out of later inputs; of its own, too, where one of its flows arrived nowhere
+        # results of later inputs, and its own results if one of its flows arrived nowhere
         later = [end for first, end in rows if first > start and end is not None]
         dropped = any(end is None for first, end in rows if first == start)
         choice = own + later if dropped else own

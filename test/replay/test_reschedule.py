@@ -216,7 +216,7 @@ def test_what_computes_without_the_interpreter_shares_the_cpus(tmp_path):
     assert responses(path) == [12, 12]
     assert sorted(responses(path, cpus=1)) == [21, 24]
     assert responses(path, workers=1) == [12, 24]
-    # what is declared counts more than what was recorded
+    # the declaration counts more than the recording
     declared = replay(path).task_set.text.replace('dag: d', 'holds_interpreter: true, dag: d')
     assert responses(path, task_set=loads(declared, 'g.yaml')) == [12, 24]
     # what holds the interpreter waited for other threads of the executor
@@ -393,7 +393,7 @@ def test_overheads_are_measured_and_reproduced(tmp_path, delay, wake, early):
     sink = result['dags']['a']['sinks']['/n:c']
     expected = round((0.01 + 15 + 2 * (delay - early) + 3 * wake) * MS)
     assert sink['response_ns']['max'] == sink['response_ns']['min'] == expected
-    assert sink['completed'] == 3       # medians stand in for what is not recorded
+    assert sink['completed'] == 3       # executions that were not recorded have the median
     recorded = result['recorded']['dags']['a']['sinks']['/n:c']
     assert recorded['response_ns']['max'] == expected
     assert result['overheads'] == {

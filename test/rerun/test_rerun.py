@@ -128,7 +128,7 @@ def test_a_changed_constant_is_found_in_the_outputs(bag, graph, tmp_path, monkey
 
 
 def test_processes_share_one_interpreter(bag, graph):
-    """A node that computes in Python waits for others, also if declared for another process."""
+    """A node that computes in Python waits for the others, even if it is of another process."""
     text = GRAPH.replace('execution_time: 10ms', 'execution_time: 90ms, holds_interpreter: true')
     text = text.replace('execution_time: 5ms', 'execution_time: 60ms, holds_interpreter: true')
     graph.write_text(text)

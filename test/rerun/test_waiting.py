@@ -360,7 +360,7 @@ def test_who_is_there_is_known_at_once(bag, graph):
         return node
 
     seen, _ = run_filter(bag, graph, take, other, fill=fill)
-    # the rerun subscribes, too
+    # the rerun subscribes as well
     assert seen == [(0.0, 1), (0.0, 'guard'), (100.0, (1, 2))]
 
 

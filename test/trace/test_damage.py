@@ -49,8 +49,8 @@ def check(path, data, chunks, number, warns=False):
     """
     Check that a changed file gives a prefix, and return of how many chunks.
 
-    Every third one is read in the order of time, too. What is missing is said; where ``warns``,
-    also that something may be.
+    Every third one is read in the order of time as well.  A warning says which part is missing,
+    or, with ``warns``, that a part may be missing.
     """
     path.write_bytes(data)
     results = []
@@ -61,7 +61,7 @@ def check(path, data, chunks, number, warns=False):
             assert str(error).startswith(f'{path}: ') and '\n' not in str(error)
             results.append(-1)
             continue
-        # the index of a chunk may become a message that cannot be decoded, which is told, too
+        # the index of a chunk may become a message that cannot be decoded: one more warning
         assert len(warnings) in ((1,) if warns else (0, 1, 2))
         for text in warnings:
             assert text.startswith(f'{path}: ') and '\n' not in text
