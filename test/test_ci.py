@@ -60,6 +60,15 @@ def test_a_skip_without_a_known_reason_fails_in_continuous_integration(monkeypat
     assert not is_allowed_skip('Skipped: ros2 is not installed here')
 
 
+def test_tools_that_are_missing_are_known_with_their_packages():
+    done = subprocess.run(
+        [shutil.which('sh'), TOP / '.ci' / 'tools', 'missing'], env={'PATH': '/nowhere'},
+        text=True, capture_output=True, check=True)
+    lines = dict(line.split(' ', 1) for line in done.stdout.splitlines())
+    tests = ''.join(path.read_text(encoding='utf-8') for path in (TOP / 'test').rglob('test_*.py'))
+    assert set(lines) == set(re.findall(r"mark\.needs\('(\w+)'\)", tests))
+
+
 def test_actions_are_pinned_and_workflows_are_yaml():
     paths = sorted((TOP / '.github' / 'workflows').glob('*.yml'))
     for path in paths:

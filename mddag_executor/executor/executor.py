@@ -788,7 +788,8 @@ class MultiDeadlineExecutor(BareExecutor):
         """End an executor that was never shut down: its threads and descriptors are freed."""
         if self._ending is not None:  # else its construction has failed
             self._ending.abandon()
-        super().__del__()  # type: ignore[no-untyped-call]
+        with suppress(InvalidHandle):  # its context has ended before
+            super().__del__()  # type: ignore[no-untyped-call]
 
     def halt(self) -> None:
         """Start no more callbacks, as the interpreter ends; see ``wait_halted``."""

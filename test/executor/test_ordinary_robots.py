@@ -87,7 +87,10 @@ def test_results_that_nothing_was_published_for_are_not_due(make_executor, make_
     assert len(robot.ran['store']) == len(jobs)
     recorded = replay(path).result()
     assert verdicts(recorded) == live
-    assert verdicts(reschedule(path, workers=1).result()) == live
+    # jobs that a busy machine has dropped run in the rescheduled run
+    again = verdicts(reschedule(path, workers=1).result())
+    assert again == {name: (completed + expired, not_due, late, 0)
+                     for name, (completed, not_due, late, expired) in live.items()}
 
 
 PLAIN = ROBOT.replace(
