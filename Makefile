@@ -85,7 +85,7 @@ check-fresh:
 
 nightly: mutations soak stress fuzz
 	@MDDAG_THOROUGH=20 HARDENING_EXAMPLES=1000 $(BIN)/python -m pytest $(PYTEST_ARGS) -q \
-		test/core test/msg_graph test/hardening test/laboratory test/replay test/simulate test/trace
+		test/core test/msg_graph test/hardening test/laboratory test/sources test/analysis test/whatif test/simulate test/trace
 
 mutations: env
 	@$(BIN)/python -m pytest -q -m nightly test/executor/mutations
@@ -93,7 +93,7 @@ mutations: env
 FUZZ_SECONDS ?= 600
 
 fuzz: env
-	@FUZZ_SECONDS=$(FUZZ_SECONDS) $(BIN)/python -m pytest -q -s test/replay/test_fuzz.py
+	@FUZZ_SECONDS=$(FUZZ_SECONDS) $(BIN)/python -m pytest -q -s test/sources/test_fuzz.py
 
 SOAK_SECONDS ?= 600
 

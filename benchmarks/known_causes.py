@@ -33,9 +33,8 @@ import tempfile
 import threading
 import time
 
-from mddag_executor import MultiDeadlineExecutor
+from mddag_executor import MultiDeadlineExecutor, replay
 from mddag_executor.executor.timers import TimerQueue, TimerSource
-from mddag_executor.replay import replay
 from msg_graph import loads
 import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup

@@ -19,7 +19,6 @@ import time
 from typing import Any
 
 from mddag_executor.hosting.child import run_child
-from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
     draw_execution_times,
     periodic_load,
@@ -28,6 +27,7 @@ from mddag_executor.simulate import (
     simulate,
 )
 from mddag_executor.trace import TraceReader
+from mddag_executor.whatif.run_writer import write_trace
 from msg_graph import TaskSet
 
 LIMIT_S = 3600.0
@@ -67,26 +67,26 @@ def _read_sorted(path: str, limit: int) -> int:
 
 
 def _link(path: str, limit: int) -> int:
-    from mddag_executor.replay.run import open_recording
+    from mddag_executor.sources.open import open_recording
     open_recording(path)
     return TraceReader(path).message_count or 0
 
 
 def _replay(path: str, limit: int) -> int:
-    from mddag_executor.replay import replay
+    from mddag_executor import replay
     outcome = replay(path)
     assert outcome.result()['dags']
     return TraceReader(path).message_count or 0
 
 
 def _reschedule(path: str, limit: int) -> int:
-    from mddag_executor.replay import reschedule
+    from mddag_executor import reschedule
     assert reschedule(path).result()['dags']
     return TraceReader(path).message_count or 0
 
 
 def _exported(form: str, path: str, limit: int) -> int:
-    from mddag_executor.replay import replay
+    from mddag_executor import replay
     from mddag_executor.report.export import write
     with open(os.devnull, 'wb') as file:
         write(form, file, replay(path), 'executions')

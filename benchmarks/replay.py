@@ -192,7 +192,7 @@ def _compared(
     recorded_before: str, path: str, utilisation: float, workers: int, recorded_workers: int
 ) -> dict[str, Any]:
     """Return how well a run is predicted from a recording of the same or another run."""
-    from mddag_executor.replay import replay, reschedule
+    from mddag_executor import replay, reschedule
     skip = _WARM_UP_S * 1_000_000_000
     recorded = replay(path, skip=skip).result()
     predicted = reschedule(recorded_before, workers=workers, skip=skip).result()

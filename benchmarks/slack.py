@@ -45,8 +45,8 @@ def check_slack(
     args: argparse.Namespace, task_set: TaskSet, folder: str, record: Record
 ) -> dict[str, Any]:
     """Return the result of `replay --slack`."""
-    from mddag_executor.replay.slack import find_slack, NOTHING, Problem
     from mddag_executor.simulate import draw_execution_times, periodic_load, Settings
+    from mddag_executor.whatif.slack import find_slack, NOTHING, Problem
     from msg_graph import loads
     times = _times(task_set, args.utilisation[0], args.workers[0])
     fixed = loads(with_times(task_set, times), task_set.file)
@@ -113,7 +113,7 @@ def with_times(task_set: TaskSet, times: dict[str, int]) -> str:
 
 def _misses(trace: str) -> tuple[int, int]:
     """Return the number of missed deadlines, and of additional ones through disturbances."""
-    from mddag_executor.replay import replay
+    from mddag_executor import replay
     jobs = replay(trace, skip=WARM_UP_NS).explanation.result()['jobs']
     count = [is_counted(job) for job in jobs]
     return sum(count), len(count) - sum(count)

@@ -3,8 +3,8 @@
 """
 The parts of the program know one another in one direction only.
 
-    cli -> rerun -> report, hosting -> (executor | replay | laboratory) -> simulate
-        -> trace, core -> msg_graph
+    cli -> rerun -> report, hosting -> (executor | laboratory | whatif -> analysis -> sources)
+        -> simulate, recording -> trace, core -> msg_graph
 
 Imports are read from the sources, those inside functions and for type checkers included. Ruff
 (`SLF`) checks which modules use private names of rclpy.
@@ -24,15 +24,22 @@ LEVELS = {part: level for level, parts in enumerate((
     ('mddag_executor.resources',),
     ('mddag_executor',),  # its __init__.py, to those who want the version
     ('mddag_executor.core', 'mddag_executor.trace'),
-    # simulate is below replay, which reschedules with its engine
+    # simulate is below whatif, which reschedules with its engine
     ('mddag_executor.recording', 'mddag_executor.simulate'),
-    ('mddag_executor.laboratory', 'mddag_executor.executor', 'mddag_executor.replay'),
+    ('mddag_executor.sources',), ('mddag_executor.analysis',),
+    ('mddag_executor.laboratory', 'mddag_executor.executor', 'mddag_executor.whatif'),
     ('mddag_executor.report', 'mddag_executor.hosting'), ('mddag_executor.rerun',),
     ('mddag_executor.cli',), ('mddag_executor.__main__',))) for part in parts}
 # What mddag_executor/__init__.py passes on belongs to the part that it comes from.
 PASSED_ON = {'mddag_executor.DeadlineMiss': 'mddag_executor.executor',
              'mddag_executor.MultiDeadlineExecutor': 'mddag_executor.executor',
-             'mddag_executor.open_recording': 'mddag_executor.replay'}
+             'mddag_executor.open_recording': 'mddag_executor.sources',
+             'mddag_executor.Traces': 'mddag_executor.sources',
+             'mddag_executor.ReplayError': 'mddag_executor.recording',
+             'mddag_executor.Replay': 'mddag_executor.analysis',
+             'mddag_executor.replay': 'mddag_executor.analysis',
+             'mddag_executor.Reschedule': 'mddag_executor.whatif',
+             'mddag_executor.reschedule': 'mddag_executor.whatif'}
 # The core takes events with their times and answers with decisions; it asks for nothing.
 NOT_IN_CORE = {
     'asyncio', 'concurrent', 'datetime', 'io', 'logging', 'multiprocessing', 'os', 'pathlib',

@@ -34,8 +34,8 @@ from mddag_executor.output_rules import (
 from mddag_executor.text import listed
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.run import Traces
     from mddag_executor.report.html_data import ReportData
+    from mddag_executor.sources.open import Traces
     from msg_graph import TaskSet
 
 R = TypeVar('R', bound='str | Traces')
@@ -124,13 +124,13 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
         return paths[0]
     if '-' in paths:
         raise UsageError('-: of several traces none can be standard input: name them')
-    from mddag_executor.replay import Traces
+    from mddag_executor.sources.open import Traces
     return Traces(paths, dict(offsets))
 
 
 def _traces_in(path: str) -> Sequence[str]:
     if os.path.isdir(path):
-        from mddag_executor.replay.bags import is_ordinary
+        from mddag_executor.sources.bags import is_ordinary
         names = os.listdir(path)
         found = sorted(name for name in names if name.endswith('.mcap'))
         if found and 'metadata.yaml' not in names and not is_ordinary(path):

@@ -85,7 +85,7 @@ def _results(
 
 
 def _has_declaration(source: Source) -> bool:
-    from mddag_executor.replay.run import has_declaration
+    from mddag_executor.sources.open import has_declaration
     # several traces can be joined only if each has a declaration
     return source.task_set is not None or not isinstance(source.path, str) or (
         not source.is_bag and has_declaration(source.path, source.name))

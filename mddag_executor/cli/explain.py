@@ -3,7 +3,7 @@
 """
 The verb `explain`: why each deadline of a recorded run was missed.
 
-The run is judged as `replay` does it; `mddag_executor.replay.causes` says what the causes are.
+The run is judged as `replay` does it; `mddag_executor.analysis.causes` says what the causes are.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mddag_executor.cli.text import printable, warn
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
-    from mddag_executor.replay import Replay
+    from mddag_executor.analysis.as_recorded import Replay
     from msg_graph import TaskSet
 
 EXAMPLE = """\

@@ -19,8 +19,9 @@ from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
-    from mddag_executor.replay import Replay, Reschedule
-    from mddag_executor.replay.run import Given
+    from mddag_executor.analysis.as_recorded import Replay
+    from mddag_executor.sources.open import Given
+    from mddag_executor.whatif.reschedule import Reschedule
     from msg_graph import Process, TaskSet
 
 _ONLY_RESCHEDULED = (
@@ -87,14 +88,14 @@ class Source(NamedTuple):
     @property
     def is_bag(self) -> bool:
         """Return whether it is an ordinary bag, which can only be rescheduled."""
-        from mddag_executor.replay.bags import is_ordinary
+        from mddag_executor.sources.bags import is_ordinary
         return isinstance(self.path, str) and is_ordinary(self.path)
 
     def check_deadlines(self) -> None:
         """Check that the recording itself has deadlines."""
         if self.is_bag:
             raise self.no_graph()
-        from mddag_executor.replay.run import check_declared
+        from mddag_executor.sources.open import check_declared
         check_declared(self.path, self.name)
 
     def no_graph(self) -> UsageError:
@@ -106,7 +107,7 @@ class Source(NamedTuple):
 
 def source_of(args: argparse.Namespace) -> Source:
     """Return the recording that TRACE… names, with GRAPH's task set."""
-    from mddag_executor.replay.bags import opened_trace
+    from mddag_executor.sources.bags import opened_trace
     task_set = None if args.graph is None else common.load_graph(args.graph)
     path, name = common.input_path(args.trace)
     trace = opened_trace(path) if isinstance(path, str) else None
@@ -118,7 +119,7 @@ def as_recorded(
     end: int | None = None,
 ) -> Replay:
     """Replay a recorded run, or the part of it from ``begin`` to ``end``."""
-    from mddag_executor.replay import replay
+    from mddag_executor.analysis.as_recorded import replay
     span = span_of(begin, end)
     if source.is_bag:
         raise source.no_graph()
@@ -148,7 +149,7 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
         return _rescheduled_bag(args, source, settings)
     options.refuse(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
-    from mddag_executor.replay import reschedule
+    from mddag_executor.whatif.reschedule import reschedule
     with Progress('replaying') as line:
         return reschedule(
             source.path, source.task_set, overheads=args.overheads is None,
@@ -159,8 +160,8 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
 def _rescheduled_bag(
     args: argparse.Namespace, source: Source, settings: dict[str, Any]
 ) -> Reschedule:
-    from mddag_executor.replay.bags_reschedule import reschedule_bag
     from mddag_executor.simulate import read_execution_times
+    from mddag_executor.whatif.bags_reschedule import reschedule_bag
     path, task_set = source.path, source.task_set
     assert isinstance(path, str)
     if args.processes is not None:

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from mddag_executor.replay import Replay
+    from mddag_executor.analysis.as_recorded import Replay
     common.recording_and_graph(args)
     recorded.check(args)
     outcome = recorded.outcome_of(args, recorded.source_of(args))

@@ -56,8 +56,8 @@ def main(args: argparse.Namespace) -> int:
             task_set, load, settings, utilisation=utilisation(task_set, times, workers),
             log=bool(args.trace or args.report or required), progress=line.update)
     if args.trace is not None:
-        from mddag_executor.replay.run_writer import write_trace
         from mddag_executor.trace.trace_file import whole_trace
+        from mddag_executor.whatif.run_writer import write_trace
         with whole_trace(args.trace, True) as path:
             write_trace(path, task_set, load, run)
     if args.report is not None:
@@ -65,9 +65,8 @@ def main(args: argparse.Namespace) -> int:
         common.write_report(args.report, of_run(task_set, load, run))
     paths: dict[str, Any] = {}
     if required:
-        from mddag_executor.replay.computed import ComputedRun
-        from mddag_executor.replay.requirements import of_computed
-        paths = of_computed(ComputedRun.of_run(task_set, load, run))
+        from mddag_executor.whatif.computed import ComputedRun
+        paths = ComputedRun.of_run(task_set, load, run).requirements()
     result = {
         **run.result(), **paths, 'file': task_set.file, 'judge': run.settings.judge,
         'seed': args.seed if args.execution_times is None else None, 'ended_ns': run.ended_ns,

@@ -6,7 +6,7 @@ The verb `slack`: how much longer callbacks may take before a deadline is missed
 If deadlines are missed already, it says how much less they must take.
 
 A recorded run is rescheduled (see `replay --reschedule`), a declaration is simulated (see
-`simulate`), as often as it takes; `mddag_executor.replay.slack` says how.
+`simulate`), as often as it takes; `mddag_executor.whatif.slack` says how.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mddag_executor.core.tally import total
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.slack import Problem
+    from mddag_executor.whatif.slack import Problem
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -58,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     from mddag_executor.core.tolerances import NOTHING_DUE
-    from mddag_executor.replay.slack import find_slack, slack_result
     from mddag_executor.report.slack import lines, page
+    from mddag_executor.whatif.slack import find_slack, slack_result
     common.recording_and_graph(args)
     is_graph = common.is_graph(str(args.trace))
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
@@ -82,8 +82,8 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
-    from mddag_executor.replay import reschedule
-    from mddag_executor.replay.slack import Problem
+    from mddag_executor.whatif.reschedule import reschedule
+    from mddag_executor.whatif.slack import Problem
     options.refuse(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
     source = recorded.source_of(args)
     if source.is_bag:
@@ -103,9 +103,9 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
 
 def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
     from mddag_executor.core import Tables
-    from mddag_executor.replay.slack import Problem
     from mddag_executor.simulate import periodic_load, Settings
     from mddag_executor.simulate import simulate as simulated
+    from mddag_executor.whatif.slack import Problem
     if args.graph is not None:
         raise UsageError(f'{args.graph}: there is a declaration already: give one, or a trace '
                          'before it')

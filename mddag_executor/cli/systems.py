@@ -13,12 +13,12 @@ from mddag_executor.cli.text import Progress, say, warn
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
-    from mddag_executor.replay.drafting import System
+    from mddag_executor.analysis.drafting import System
 
 
 def recorded_system(given: str) -> System:
     """Return the system in a trace (`-`: standard input), or in a session of LTTng (a folder)."""
-    from mddag_executor.replay.drafting import System
+    from mddag_executor.analysis.drafting import System
     with Progress('reading the trace') as line:
         if given != '-' and Path(given).is_dir():
             from mddag_executor.trace import import_ctf

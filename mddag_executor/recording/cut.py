@@ -37,7 +37,7 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
 
     :param begin: begin of the range, ns after the start of the recording; ``end``: likewise.
     :raises ValueError: if the range is empty or begins before the recording.
-    :raises mddag_executor.replay.ReplayError: if it begins after the recording.
+    :raises mddag_executor.ReplayError: if it begins after the recording.
     """
     if not 0 <= begin < end:
         raise ValueError(f'from {begin} to {end} ns is no range of time')

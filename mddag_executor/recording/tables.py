@@ -6,7 +6,7 @@ A recording: tables with named columns, and the nodes and callbacks that they re
 Theory of operation
 -------------------
 1. Every recording has the same tables of named columns (``columns``).  A reader (``own``,
-   ``replay.imported_run``, …) builds them once; an analysis is a function of them and does
+   ``sources.imported_run``, …) builds them once; an analysis is a function of them and does
    not depend on the reader.
 2. Times are int64 nanoseconds on the clock of the recording.  ``UNKNOWN`` (-1) is a time or number
    that is not recorded.

@@ -23,10 +23,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from mddag_executor.analysis.as_recorded import Replay
+from mddag_executor.analysis.usage import ran
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by
-from mddag_executor.replay import Replay
-from mddag_executor.replay.usage import ran
 import numpy as np
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from mddag_executor.replay.causes import REMEDIES
+from mddag_executor.analysis.causes import REMEDIES
 from mddag_executor.report.tables import percent, short_names
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
 from mddag_executor.text import counted

@@ -9,9 +9,9 @@ import csv
 import io
 from typing import Any, BinaryIO
 
+from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.errors import MddagError
 from mddag_executor.recording.frames import named, numbers
-from mddag_executor.replay import Replay
 from mddag_executor.report.columns import Column, executions, jobs
 from mddag_executor.report.text import printable
 import numpy as np

@@ -14,11 +14,10 @@ from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 from mddag_executor import __version__
+from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.core.requirements import as_dags, not_met
 from mddag_executor.core.tally import total
 from mddag_executor.recording.tables import Ints
-from mddag_executor.replay import Replay, Reschedule
-from mddag_executor.replay.computed import ComputedRun
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.html_data import json_for_html, page_data, ReportData, shown_misses
 from mddag_executor.report.html_tables import (
@@ -44,6 +43,8 @@ from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import Timeline
 from mddag_executor.simulate import Load, SimulatedRun
 from mddag_executor.text import counted
+from mddag_executor.whatif.computed import ComputedRun
+from mddag_executor.whatif.reschedule import Reschedule
 from msg_graph import TaskSet
 
 _SCRIPT = Path(__file__).with_name('html.js')

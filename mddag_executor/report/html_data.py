@@ -15,12 +15,12 @@ from collections.abc import Iterator, Mapping, Sequence
 import json
 from typing import Any, NamedTuple
 
+from mddag_executor.analysis.as_recorded import Replay
+from mddag_executor.analysis.usage import PoolUse
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import counts, SinkTally, VERDICTS
 from mddag_executor.recording.columns import Table
 from mddag_executor.recording.tables import Ints, look_up, rows_by
-from mddag_executor.replay import Replay
-from mddag_executor.replay.usage import PoolUse
 from mddag_executor.report.columns import executions
 from mddag_executor.report.tables import missed_share, short_names
 from mddag_executor.report.text import format_ns, printable, shortened

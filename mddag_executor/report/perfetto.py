@@ -27,11 +27,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, BinaryIO
 
+from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.core import legs_of
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.tables import Ints, NOTHING, sort_by, VERTEX
-from mddag_executor.replay import Replay
 from mddag_executor.report.columns import executions
 from mddag_executor.report.protobuf import Bytes, fixed, joined, message, number, texts, where
 from mddag_executor.report.text import format_ns, printable

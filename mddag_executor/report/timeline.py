@@ -11,9 +11,9 @@ rest is spread over the run.
 
 from __future__ import annotations
 
+from mddag_executor.analysis.deadlines import Judged
+from mddag_executor.analysis.usage import in_one, PoolUse, ran, worker_spans
 from mddag_executor.recording.tables import Ints, Recording
-from mddag_executor.replay.deadlines import Judged
-from mddag_executor.replay.usage import in_one, PoolUse, ran, worker_spans
 import numpy as np
 
 MOST_EXECUTIONS = 20_000

@@ -21,13 +21,13 @@ from mddag_executor.core import NEVER, Tables
 from mddag_executor.errors import UsageError
 from mddag_executor.output_rules import is_recording
 from mddag_executor.recording.tables import Recording
-from mddag_executor.replay.bags import Bag, is_ordinary
-from mddag_executor.replay.load import LoadBuilder
-from mddag_executor.replay.run import open_recording
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.simulate import draw_execution_times, periodic_load, read_execution_times
+from mddag_executor.sources.bags import Bag, is_ordinary
+from mddag_executor.sources.open import open_recording
 from mddag_executor.trace.channels import Topic
+from mddag_executor.whatif.load import LoadBuilder
 from msg_graph import TaskSet
 
 RECORDED, DECLARED = 'recorded', 'declared'
@@ -52,7 +52,7 @@ class MessageBag:
     :ivar pauses: from when to when none came (see ``trace.times``).
     :ivar topics: every topic in it.
     :ivar kinds: the type of each topic, as far as it has been loaded.
-    :raises mddag_executor.replay.bags.BagError: if there is no bag.
+    :raises mddag_executor.sources.bags.BagError: if there is no bag.
     """
 
     def __init__(self, path: str, name: str | None = None) -> None:

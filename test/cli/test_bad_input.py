@@ -9,9 +9,9 @@ from mddag_executor.trace import TraceFile
 import numpy as np
 import pytest
 
-from ..replay.bags import write_bag
-from ..replay.recorded import four_jobs
-from ..replay.test_joining import Trace, TWO
+from ..sources.bags import write_bag
+from ..sources.recorded import four_jobs
+from ..sources.test_joining import Trace, TWO
 from . import golden
 
 GRAPH = """\

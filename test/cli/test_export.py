@@ -5,8 +5,8 @@
 import os
 from pathlib import Path
 
+from mddag_executor import open_recording
 from mddag_executor.recording.tables import TABLES
-from mddag_executor.replay import open_recording
 import pytest
 
 DEMO = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'

@@ -14,9 +14,9 @@ import shutil
 
 import pytest
 
-from ..replay.recorded import four_jobs, MS, Recorded
 from ..report import runs
 from ..report.drawn import GRAPH
+from ..sources.recorded import four_jobs, MS, Recorded
 from ..trace.ctf_session import session
 from . import golden
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ..replay.recorded import MS
 from ..report.runs import by_hand, GRAPH
+from ..sources.recorded import MS
 
 
 @pytest.fixture

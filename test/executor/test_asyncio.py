@@ -12,11 +12,10 @@ import sys
 import threading
 import time
 
-from mddag_executor import MultiDeadlineExecutor
+from mddag_executor import MultiDeadlineExecutor, replay
+from mddag_executor.analysis.drift import drift_of
 from mddag_executor.executor import current_job
 from mddag_executor.executor.asyncio_loop import Turnstile
-from mddag_executor.replay import replay
-from mddag_executor.replay.drift import drift_of
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup

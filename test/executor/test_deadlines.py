@@ -6,8 +6,8 @@ from functools import partial
 import threading
 import time
 
+from mddag_executor import replay, reschedule
 from mddag_executor.executor import current_job
-from mddag_executor.replay import replay, reschedule
 from msg_graph import loads
 import pytest
 from rclpy.executors import ExternalShutdownException

@@ -9,6 +9,8 @@ from types import NoneType, SimpleNamespace, UnionType
 from typing import get_args, get_origin, get_type_hints, is_typeddict, Union
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from mddag_executor import open_recording
+from mddag_executor.analysis.drift import drift_of
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.requirements import RequirementTally
 from mddag_executor.core.state import SINK_EXPIRED, SINK_IN_TIME, SINK_LATE
@@ -17,8 +19,6 @@ from mddag_executor.executor.diagnostics import DagWatch, ERROR, OK, Requirement
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.statistics_types import Statistics
 from mddag_executor.executor.watch import Watch
-from mddag_executor.replay import open_recording
-from mddag_executor.replay.drift import drift_of
 from mddag_executor.report.board import Board
 from mddag_executor.report.live_runs import live_lines
 from msg_graph import loads, Path

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages that the middleware dropped are counted by the gaps in their numbers."""
 
+from mddag_executor import replay
 from mddag_executor.executor import gaps
 from mddag_executor.executor.gaps import Gaps
-from mddag_executor.replay import replay
 from msg_graph import loads
 import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy

@@ -8,11 +8,10 @@ import threading
 import time
 
 from benchmarks.known_causes import causes, record
-from mddag_executor import open_recording
+from mddag_executor import open_recording, replay, reschedule
+from mddag_executor.analysis.drafting import System
 from mddag_executor.core.tally import total
 from mddag_executor.executor import current_job
-from mddag_executor.replay import replay, reschedule
-from mddag_executor.replay.drafting import System
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest

@@ -15,9 +15,9 @@ import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
+from mddag_executor import replay
 from mddag_executor.core.tally import total
 from mddag_executor.executor import misses
-from mddag_executor.replay import replay
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup

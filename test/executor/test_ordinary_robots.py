@@ -7,9 +7,9 @@ from functools import partial
 from itertools import count
 import time
 
+from mddag_executor import replay, reschedule
+from mddag_executor.analysis.drafting import System
 from mddag_executor.executor import current_job
-from mddag_executor.replay import replay, reschedule
-from mddag_executor.replay.drafting import System
 from msg_graph import loads
 from msg_graph.draft import accept, declaration_of
 import pytest

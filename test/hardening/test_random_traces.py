@@ -3,7 +3,7 @@
 """
 Traces that are sound as files and say anything: every verb uses or refuses them, no traceback.
 
-The events are those of `test/replay/test_fuzz.py`: left out, doubled, in other places, with other
+The events are those of `test/sources/test_fuzz.py`: left out, doubled, in other places, with other
 values; and some are of another run. One trace in eight is made of a recorded run, the others of a
 small simulated one. `HARDENING_EXAMPLES=10000` tries that many.
 """
@@ -18,8 +18,8 @@ from mddag_executor.trace import read_events, TraceFile
 from mddag_executor.trace.schema import EVENTS
 import pytest
 
-from ..replay.helpers import PATHS, SMALL
-from ..replay.lies import tell_lies
+from ..sources.helpers import PATHS, SMALL
+from ..sources.lies import tell_lies
 from .verbs import run
 
 EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '32'))

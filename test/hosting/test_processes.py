@@ -10,11 +10,11 @@ import signal
 import subprocess
 import sys
 
+from mddag_executor import replay
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
 from mddag_executor.hosting import processes
 from mddag_executor.hosting.session import Session
-from mddag_executor.replay import replay
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest

@@ -9,13 +9,12 @@ import random
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.assign_deadlines import assigned
 from mddag_executor.laboratory.tasks import tasks_of
-from mddag_executor.replay.requirements import of_computed
 from msg_graph import load, loads
 from msg_graph.edit import with_deadlines
 from msg_graph.segments import bound, segments
 import pytest
 
-from ..replay.path_systems import random_system, simulated_run
+from ..analysis.path_systems import random_system, simulated_run
 
 TOP = Path(__file__).resolve().parents[2]
 GRAPH = """\
@@ -99,7 +98,7 @@ def holds(task_set):
             assert bound(task_set, path, what) <= required
     result, run = simulated_run(task_set)
     if not result['deadline_missed']:
-        for name, every in of_computed(run)['requirements'].items():
+        for name, every in run.requirements()['requirements'].items():
             for what, each in every.items():
                 assert each['completed'] > 0 and not each['late'], (task_set.file, name, what)
     return not result['deadline_missed']

@@ -5,7 +5,7 @@
 import csv
 import io
 
-from mddag_executor.replay import replay
+from mddag_executor import replay
 from mddag_executor.report.export import _harmless, write
 import pytest
 

@@ -10,11 +10,10 @@ import re
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor import Replay, replay
+from mddag_executor.analysis.deadlines import Judged
+from mddag_executor.analysis.paths import Paths
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE
-from mddag_executor.replay import Replay, replay
-from mddag_executor.replay.deadlines import Judged
-from mddag_executor.replay.paths import Paths
-from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.report import html
 from mddag_executor.report.diff import callbacks_table, compare, sinks_table
 from mddag_executor.report.html_data import (
@@ -28,11 +27,12 @@ from mddag_executor.report.html_data import (
 )
 from mddag_executor.report.html_tables import html_table
 from mddag_executor.report.perfetto import write_perfetto
+from mddag_executor.whatif.run_writer import write_trace
 import msg_graph
 import numpy as np
 import pytest
 
-from ..replay.recorded import four_jobs, Recorded
+from ..sources.recorded import four_jobs, Recorded
 from . import runs
 
 

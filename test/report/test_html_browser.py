@@ -6,7 +6,7 @@ import os
 import shutil
 import time
 
-from mddag_executor.replay import replay
+from mddag_executor import replay
 from mddag_executor.report import html
 from mddag_executor.report.html_tables import MOST_ROWS
 import msg_graph

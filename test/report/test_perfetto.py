@@ -6,7 +6,7 @@ from collections import Counter
 import io
 from typing import NamedTuple
 
-from mddag_executor.replay import replay
+from mddag_executor import replay
 from mddag_executor.report.perfetto import write_perfetto
 import pytest
 

@@ -2,19 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Timelines: what is shown of a schedule is what its trace says, and no more than asked for."""
 
-from mddag_executor.replay import open_recording, replay, reschedule
-from mddag_executor.replay.bags_reschedule import reschedule_bag
-from mddag_executor.replay.computed import ComputedRun
-from mddag_executor.replay.run_writer import write_trace
+from mddag_executor import open_recording, replay, reschedule
 from mddag_executor.report import html
 from mddag_executor.report.timeline import Timeline
 from mddag_executor.simulate import periodic_load, Settings, simulate
+from mddag_executor.whatif.bags_reschedule import reschedule_bag
+from mddag_executor.whatif.computed import ComputedRun
+from mddag_executor.whatif.run_writer import write_trace
 import msg_graph
 import numpy as np
 import pytest
 
-from ..replay.bags import BY_HEADER, write_bag
 from ..report import runs
+from ..sources.bags import BY_HEADER, write_bag
 
 
 def same_tables(ours, theirs, times=1):

@@ -11,10 +11,9 @@ import threading
 import uuid
 
 from builtin_interfaces.msg import Time
-from mddag_executor import open_recording
+from mddag_executor import open_recording, replay
 from mddag_executor.core import Tables
 from mddag_executor.laboratory.generate import generate, Options
-from mddag_executor.replay import replay
 from mddag_executor.rerun import assert_same, CallbackFailed, compare, programs, rerun, RerunError
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.inputs import MessageBag, open_input

@@ -9,10 +9,9 @@ import tempfile
 
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
+from mddag_executor import replay, reschedule
 from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
 from mddag_executor.errors import MddagError, UsageError
-from mddag_executor.replay import replay, reschedule
-from mddag_executor.replay.run_writer import write_trace
 from mddag_executor.simulate import (
     draw_execution_times,
     END,
@@ -23,6 +22,7 @@ from mddag_executor.simulate import (
     simulate,
     utilisation,
 )
+from mddag_executor.whatif.run_writer import write_trace
 from msg_graph import load, loads
 import pytest
 

@@ -10,7 +10,7 @@ import subprocess
 from mddag_executor.trace import import_ctf, read_events, TraceError, TraceReader
 import pytest
 
-from ..replay.caret import CARET
+from ..sources.caret import CARET
 from ..trace.ctf_session import CLOCK_OFFSET, session
 
 START = ('ros2:callback_start', [('callback', 'u64'), ('is_intra_process', 'i32')])

@@ -1,0 +1,174 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Replay as recorded: judge the deadlines of a run and break down its response times."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+from mddag_executor.analysis.chains import Chains
+from mddag_executor.analysis.communications import communications, recorded_callbacks
+from mddag_executor.analysis.deadlines import Judged
+from mddag_executor.analysis.drift import drift_of
+from mddag_executor.analysis.explain import Explanation
+from mddag_executor.analysis.paths import Paths
+from mddag_executor.analysis.requirements import Requirements
+from mddag_executor.analysis.usage import group_waits, share, Usage
+from mddag_executor.core import NEVER
+from mddag_executor.recording.head import ReplayError
+from mddag_executor.recording.tables import Recording
+from mddag_executor.sources.open import Given, open_recording, Progress
+from mddag_executor.text import counted
+from msg_graph import TaskSet
+from msg_graph.drift import Drift
+
+
+class Replay:
+    """
+    A recording and its evaluation.
+
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
+    :ivar judged: the verdicts; ``tally`` has their sums.
+    :ivar warnings: missing or doubtful data, one line each.
+    """
+
+    def __init__(self, recording: Recording, skip: int = 0) -> None:
+        self.recording, self.task_set = recording, recording.task_set
+        self.judged = Judged(recording, skip)
+        self.tally = self.judged.tally
+        self.warnings = list(recording.warnings)
+        if self.judged.contradictions:
+            self.warnings.append(
+                f'{recording.name}: left out: {counted(self.judged.contradictions, "event")} that '
+                'contradict earlier ones')
+        verdicts = self.judged.verdicts
+        early = (verdicts['completed'] >= 0) & (verdicts['completed'] < verdicts['release'])
+        if early.any():
+            self.warnings.append(
+                f'{recording.name}: {counted(int(early.sum()), "result")} before the release of '
+                'the job: clocks differ, or times are damaged')
+        differences = self.judged.differences() if recording.shut_down else None
+        if differences is not None:
+            self.warnings.append(f'{recording.name}: {differences}')
+
+    @cached_property
+    def chains(self) -> Chains:
+        """Return the critical chains of jobs."""
+        return Chains(self.judged, self.recording.executions, self._waited)
+
+    @cached_property
+    def usage(self) -> Usage:
+        """Return how much time callbacks and workers used."""
+        end = self.recording.end
+        return Usage(self.recording, self._waited, end - self.duration_ns, end)
+
+    @cached_property
+    def explanation(self) -> Explanation:
+        """Return the causes of missed deadlines."""
+        return Explanation(self.recording, self.judged, self.chains)
+
+    @cached_property
+    def paths(self) -> Paths:
+        """Return the flows along the declared paths."""
+        return Paths(self.recording, self.judged.judge_from if self.judged.skip else -NEVER)
+
+    @cached_property
+    def requirements(self) -> Requirements:
+        """Return the verdicts about what is required of paths."""
+        return Requirements(self.recording, self.paths, self.judged.judge_from)
+
+    @cached_property
+    def _waited(self) -> Any:
+        return group_waits(self.recording)
+
+    def drift(self) -> list[Drift]:
+        """Return the differences between the run and the declaration."""
+        return drift_of(self.recording, self.judged.skip)
+
+    @property
+    def duration_ns(self) -> int:
+        """
+        Return the time from the first release or execution to the end of the run, ns.
+
+        Without jobs it is the duration of the recording.
+        """
+        recording, begun = self.recording, self.recording.head.time
+        start = begun if recording.start is None else recording.start
+        return max(0, recording.end - (
+            start if len(recording.releases) else min(start, begun)))
+
+    def result(self) -> dict[str, Any]:
+        """Return the result format of ``replay --json``."""
+        recording, head, duration = self.recording, self.recording.head, self.duration_ns
+        paths = self.paths.results()    # first, because they need the most memory
+        requirements = self.requirements.result()
+        result = {
+            'policy': head.policy, 'workers': head.workers, 'preemptive': head.preemptive,
+            'duration_ns': duration,
+            'utilisation': share(self.usage.busy, head.workers, duration),
+            **self.tally.result()}
+        breakdown, unjudged = self.chains.breakdown(), recording.unjudged
+        for dag in self.task_set.dags:
+            sinks = result['dags'][dag.name]['sinks']
+            first = self.judged.tables.first_vertex[dag.index]
+            for local in dag.sinks:
+                sink = sinks[dag.vertices[local].name]
+                sink['breakdown'] = breakdown.get(first + local)
+                sink['slack_ns'] = slack(sink)
+            if unjudged is not None:
+                result['dags'][dag.name]['unjudged'] = unjudged.get(dag.index, 0)
+        return {
+            **result, 'rescheduled': False, 'skip_ns': self.judged.skip,
+            'callbacks': self.usage.callbacks(),
+            'undeclared': self.usage.undeclared(),
+            'worker_use': self.usage.workers(head.workers),
+            'dropped': dict(sorted(recording.dropped.items())),
+            'messages_lost': recording.messages_lost,
+            'misses': self.explanation.summary(),
+            'paths': paths, **({'requirements': requirements} if requirements else {}),
+            **({} if not recording.imported else {
+                'recorded_callbacks': recorded_callbacks(recording),
+                'communications': communications(recording)}),
+            'recording': recording_result(recording),
+            'warnings': self.warnings}
+
+
+def slack(sink: dict[str, Any]) -> dict[str, int] | None:
+    """
+    Return the slack of a sink: deadline minus completion, ns; negative for late jobs.
+
+    99 % of the completions had at least the slack ``p1``.
+    """
+    response, deadline = sink['response_ns'], sink['relative_deadline_ns']
+    if response is None:
+        return None
+    return {name: deadline - response[of] for name, of in (
+        ('min', 'max'), ('p1', 'p99'), ('median', 'median'), ('max', 'min'))}
+
+
+def recording_result(run: Recording) -> dict[str, Any]:
+    """Return the part of a result that describes the trace."""
+    return {
+        'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
+        'end_ns': run.end, **(
+            {'shut_down': run.shut_down, 'lost': run.lost} if run.messages is None
+            else {'messages': run.messages})}
+
+
+def replay(
+    path: Given, task_set: TaskSet | None = None, *, name: str | None = None,
+    progress: Progress | None = None, skip: int = 0, span: tuple[int, int] | None = None,
+) -> Replay:
+    """
+    Replay a trace as recorded; see ``open_recording`` and ``Replay``.
+
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
+    :param span: begin and end of the part to replay, ns after the start; see ``Recording.cut``.
+    :raises mddag_executor.ReplayError: if it cannot be replayed, as an ordinary bag.
+    """
+    recording = open_recording(path, task_set, name, progress)
+    if recording.messages is not None:
+        raise ReplayError(recording.name, 'it is an ordinary bag, in which no callback ran',
+                          'reschedule it')
+    return Replay(recording if span is None else recording.cut(*span), skip)

@@ -1,0 +1,486 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The parts of the time of each job that missed its deadline, and the one cause of the miss.
+
+Theory of operation
+-------------------
+The time of a job, from its release to its completion at the sink (or to its early end), is split
+along its critical chain (see ``chains``):
+
+* overlap with a recorded stop of the machine: *machine*;
+* before the source is ready: *waited* while all workers were busy, so that none could notice the
+  timer or message; else *released late*;
+* ready callback: *group* while another callback of its group ran; else *waited* while all workers
+  were busy; else, with an idle worker, *interpreter* while any callback ran that may have held the
+  GIL (undeclared callbacks: unknown), *machine* while none ran;
+* the time that a job *waited*, or waited for the *interpreter*, after its demotion counts as
+  *demoted*; or as *less important* if the job could still have been in time when it was demoted,
+  so that it only made way for more important work;
+* running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
+  *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
+  is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
+* end of a callback until the next one is ready: *transport*;
+* ready callback in a recording of another executor, which does not say when a message or timer was
+  noticed: *waited* while its own thread ran a callback; with an idle thread *released late* (a
+  source), else *transport*, because the message was still on its way;
+* job that ended early because of a callback that never ran, or a sync that did not get all of its
+  messages: *dropped* if the executor dropped the message from its queue, *destroyed* if it did so
+  because the node or subscription was destroyed; *waited* if the callback was ready; *not
+  published* if the callback before it ended without publishing; else the message is *lost*.
+
+The largest part, beyond what is usual, is the cause of the miss.  Two rules precede:
+
+* Waiting during or shortly after a stall of the machine is caused by the backlog.  It counts as
+  *machine*, up to the length of the stalls.
+* If all unusual time together is less than the lateness, the usual times are too long for the
+  deadline.  Then they count as well: usual execution times as *ran long*.
+
+A job whose callback raised has *failed*.  A job that expired because of a callback that never ran
+has the cause for which that callback did not run.  A timer's release that was skipped because the
+previous execution still waited has the cause of the previous job; if that one was in time, it
+*waited*.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mddag_executor.analysis.spans import Spans
+from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
+from mddag_executor.recording.columns import concatenate, Table
+from mddag_executor.recording.columns import rows as table_of
+from mddag_executor.recording.tables import Ints, Mask
+import numpy as np
+
+CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
+          'demoted', 'less important', 'dropped', 'destroyed', 'not published', 'lost', 'failed')
+(WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, DEMOTED, LESS_IMPORTANT,
+ DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, RAN_USUALLY, UNKNOWN, SKIPPED) = range(17)
+#: Kinds of time of a job; the last three are not causes.
+PARTS = (*CAUSES, 'ran', 'unknown', 'skipped')
+#: By cause what to do about it.
+REMEDIES = {
+    'waited': 'more workers, or shorter callbacks before it',
+    'ran long': 'make the callback shorter, or declare the time that it takes',
+    'interpreter': 'give the nodes processes of their own, or release the lock while computing',
+    'group': 'give the callback a group of its own, or a reentrant one',
+    'released late': 'look at the timer, or at the way of the message from its sensor',
+    'transport': 'let the nodes share a process, or send smaller messages',
+    'machine': 'free the CPUs of other work, pin the workers, or take a machine that does not '
+               'stand still',
+    'demoted': 'less work, or a longer deadline: it could no longer be in time, so others went '
+               'first',
+    'less important': 'less work of higher importance, or a higher importance of this sink',
+    'dropped': 'shorter callbacks before it, or a longer queue (QoS depth, or without '
+               '`keep: newest`)',
+    'destroyed': 'keep the node and its subscription until the job has ended',
+    'not published': 'publish in each execution of the callback before it',
+    'lost': 'reliable QoS or a longer queue (QoS depth); if a process ended early (see the '
+            'warnings), its end',
+    'failed': 'mend what the callback raises'}
+_DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED}
+"""By reason of a drop its cause; jobs are aborted because of an earlier miss: they *waited*."""
+NO_MESSAGE = (DROPPED, DESTROYED, NOT_PUBLISHED, LOST)
+"""Causes for which a callback never ran."""
+_NOTHING_NS = 1_000_000
+_ABOUT_BITS = 4     # up to a 16th above the usual time is usual
+_ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
+_WAITS = (*_ON_WORKERS, INTERPRETER, GROUP)
+_MOST_BEHIND = 5
+
+MISSED = np.dtype([
+    ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
+    ('at', 'i8'), ('length', 'i8'), ('demoted', 'i8'), ('outranked', '?')])
+"""
+Columns of a miss: ``at`` is the vertex that the job reached, ``length`` the length of its chain,
+``demoted`` when it was demoted, ``outranked`` whether it could still have been in time then.
+"""
+PARTS_OF = np.dtype([
+    ('miss', 'i8'), ('vertex', 'i8'), ('cause', 'i8'), ('begin', 'i8'), ('end', 'i8'),
+    ('ns', 'i8'), ('place', 'i8')])
+"""
+Columns of a part of the time of a miss; ``cause`` is an index of ``PARTS``, ``place`` where the
+callback ran (see ``Pool``).
+"""
+# A time span of a miss at a vertex: of a wait its group part, of an execution its CPU time.
+_SPAN = np.dtype([
+    ('miss', 'i8'), ('vertex', 'i8'), ('kind', 'i8'), ('begin', 'i8'), ('end', 'i8'),
+    ('more', 'i8'), ('place', 'i8')])
+_LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _PENDING = range(6)
+
+
+class Pool(NamedTuple):
+    """
+    What ran and what stalled during the misses.
+
+    :ivar full: when all workers were busy; ``some``: when any callback ran that may have held the
+        GIL (a callback that lent its worker does not); ``shared``: when several held it.
+    :ivar stalls: begin and end of each stall.
+    :ivar knows_workers: whether the number of workers is known, and an idle one starts what is
+        ready.
+    :ivar place_of: by execution its place, whose callbacks may delay each other: its thread in a
+        recording of another executor, else its process; ``place_of_vertex``: the same of the last
+        execution of each vertex, -1: none.
+    :ivar threads: by thread when callbacks ran in it; None: places are processes.
+    """
+
+    full: Spans
+    some: Spans
+    shared: Spans
+    stalls: list[tuple[int, int]]
+    knows_workers: bool
+    place_of: Ints
+    place_of_vertex: Ints
+    threads: dict[int, Spans] | None
+
+
+class Usual(NamedTuple):
+    """
+    Usual times.
+
+    :ivar runs: by global vertex the execution time; ``cpu``: the CPU time.
+    :ivar lags: by DAG the release lag.
+    """
+
+    runs: Ints
+    cpu: Ints
+    lags: Ints
+
+
+STARTED = np.dtype([
+    ('vertex', 'i4'), ('leg', 'i2'), ('job', 'i8'), ('ready', 'i8'), ('start', 'i8'),
+    ('group', 'i8')])
+"""Columns of a started execution; ``group``: how long it waited for its callback group, ns."""
+
+
+class Never(NamedTuple):
+    """
+    What is known of executions that never ran.
+
+    :ivar dropped: by vertex and job why the execution was dropped, and when.
+    :ivar dropped_at: by vertex when executions were dropped whose jobs are not recorded.
+    :ivar started: executions that were started, a table of ``STARTED``.
+    :ivar unpublished: vertices and jobs whose message the callback before did not publish.
+    """
+
+    dropped: dict[tuple[int, int], tuple[str, int]]
+    dropped_at: dict[int, Ints]
+    started: Table
+    unpublished: set[tuple[int, int]]
+
+    def why_dropped(self, key: tuple[int, int]) -> str | None:
+        """Return why the execution of a vertex and job was dropped; None: it was not."""
+        return self.dropped.get(key, (None, 0))[0]
+
+    def cause(self, key: tuple[int, int], begin: int, end: int) -> int:
+        """Return why the execution of a vertex and job never ran; it did not wait at the end."""
+        reason = self.why_dropped(key)
+        if reason is not None:
+            return _DROPS.get(reason, WAITED)
+        if key in self.unpublished:
+            return NOT_PUBLISHED
+        times = self.dropped_at.get(key[0], ())
+        first, last = np.searchsorted(times, (begin, end))
+        return DROPPED if last > first else LOST
+
+    def waiting(self, vertices: Ints, times: Ints) -> Ints:
+        """Return by vertex the job whose execution waited at the given time, or -1."""
+        jobs = np.full(len(vertices), -1)
+        for vertex in np.unique(vertices).tolist():
+            mine = self.started[self.started['vertex'] == vertex]
+            mine = mine[mine['ready'].argsort(kind='stable')]
+            job, ready, start = mine['job'], mine['ready'], mine['start']
+            latest = np.maximum.accumulate(start)
+            asked = np.flatnonzero(vertices == vertex)
+            before = np.searchsorted(ready, times[asked], 'right') - 1
+            asked, before = asked[before >= 0], before[before >= 0]
+            waits = latest[before] > times[asked]
+            last = np.maximum.accumulate(np.where(start == latest, np.arange(len(start)), 0))
+            jobs[asked[waits]] = job[last[before[waits]]]
+        return jobs
+
+
+class Found(NamedTuple):
+    """
+    Misses (a table of ``MISSED``), their causes, and the parts of their times in order.
+
+    :ivar too_short: misses whose deadline is shorter than the usual times.
+    """
+
+    misses: Table
+    causes: Ints
+    parts: Table
+    too_short: Mask
+
+
+def find(
+    rows: Table, chain: Table, pool: Pool, usual: Usual, never: Never, dag_of: Ints,
+    deadline: Ints, is_source: Any,
+) -> Found:
+    """
+    Find the causes of misses.
+
+    :param rows: a table of ``MISSED``; ``chain``: the links of their chains (``chains.LINKS``),
+        one chain after the other, each from its end.
+    :param dag_of: by global vertex its DAG; ``deadline``: its relative deadline as a sink.
+    :param is_source: by global vertex whether it is its DAG's source.
+    """
+    spans = _spans(rows, chain, is_source, pool)
+    kinds, of = spans['kind'], spans['miss']
+    begins, ends = np.array(pool.stalls, dtype=np.int64).reshape(-1, 2).T
+    stalls = Spans(begins, ends)
+    stood = stalls.within(spans['begin'], spans['end'])
+    left = spans['end'] - spans['begin'] - stood
+    times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
+    times[:, MACHINE] = stood
+    for kind, part in ((_LAG, RELEASED_LATE), (_TRANSPORT, TRANSPORT), (_BEFORE, UNKNOWN)):
+        times[kinds == kind, part] = left[kinds == kind]
+    lags = kinds == _LAG
+    if pool.knows_workers:
+        times[lags, WAITED] = np.minimum(
+            left[lags], pool.full.within(spans['begin'][lags], spans['end'][lags]))
+        times[lags, RELEASED_LATE] -= times[lags, WAITED]
+    runs = kinds == _RUN
+    normal = usual.runs[spans['vertex']]
+    usually = np.where(left <= normal + (normal >> _ABOUT_BITS), left, normal)
+    times[runs, RAN_USUALLY] = usually[runs]
+    times[runs] += _ran_long(spans[runs], (left - usually)[runs], usual, pool)
+    _pending(rows, spans, times, left, never, pool, is_source)
+    waits = kinds == _WAIT
+    if waits.any():
+        times[waits] += _waits(spans[waits], left[waits], pool, is_source)
+        demoted = np.maximum(0, spans['end'] - np.maximum(spans['begin'], rows['demoted'][of]))
+        for part in (WAITED, INTERPRETER):
+            moved = np.where(waits, np.minimum(times[:, part], demoted), 0)
+            times[:, part] -= moved
+            times[:, DEMOTED] += np.where(rows['outranked'][of], 0, moved)
+            times[:, LESS_IMPORTANT] += np.where(rows['outranked'][of], moved, 0)
+            demoted -= moved
+    total = np.zeros((len(rows), len(PARTS)), dtype=np.int64)
+    np.add.at(total, of, times)
+    sinks = rows['sink']
+    unusual = total[:, :len(CAUSES)].copy()
+    unusual[:, RELEASED_LATE] = np.maximum(0, total[:, RELEASED_LATE] - usual.lags[dag_of[sinks]])
+    # the deadline is shorter than the usual times
+    excess, lateness = unusual.sum(axis=1), rows['until'] - rows['release'] - deadline[sinks]
+    short: Mask = (excess == 0) | ((rows['kind'] == SINK_LATE) & (excess < lateness))
+    amounts = np.where(short[:, np.newaxis], total[:, :len(CAUSES)], unusual)
+    amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
+    causes = _causes(rows, total, amounts, pool, never, is_source)
+    which, cause = np.nonzero(times)
+    parts = table_of(PARTS_OF, len(which), cause=cause, ns=times[which, cause], **{
+        name: spans[name][which] for name in ('miss', 'vertex', 'begin', 'end', 'place')})
+    return Found(rows, causes, parts, short)
+
+
+def _spans(rows: Table, chain: Table, is_source: Any, pool: Pool) -> Table:
+    """Return the time spans of misses, each miss in order."""
+    n, lengths = len(rows), rows['length']
+    first = np.cumsum(lengths) - lengths
+    of = np.repeat(np.arange(n), lengths)
+    # last link of its chain, which comes first in the table
+    is_last = np.zeros(len(chain), dtype=np.bool_)
+    is_last[first[lengths > 0]] = True
+    until = rows['until'][of]
+    ready, start, end = chain['ready'], chain['start'], chain['end']
+    after = np.where(is_last, until, np.r_[0, ready[:-1]])
+    done = np.maximum(start, np.minimum(end, after))
+    at = chain['vertex']
+    after_vertex = np.where(is_last, rows['at'][of], np.r_[0, at[:-1]])
+    onward = np.where(is_last, _PENDING, _TRANSPORT)
+    some = lengths > 0
+    begins = (first + lengths - 1)[some]
+    whole = is_source[at[begins]]
+    everyone = np.arange(n)
+
+    def columns(*each: Any) -> Table:
+        return table_of(_SPAN, len(each[0]), **dict(zip(_SPAN.names or (), each)))
+
+    own = pool.place_of[chain['row']]
+    spans = concatenate([
+        columns(everyone[some], at[begins], np.where(whole, _LAG, _BEFORE),
+                rows['release'][some], ready[begins], 0, own[begins]),
+        columns(everyone[~some], rows['at'][~some], _PENDING, rows['release'][~some],
+                rows['until'][~some], 0, pool.place_of_vertex[rows['at'][~some]]),
+        columns(of, at, _WAIT, ready, start, chain['group'], own),
+        columns(of, at, _RUN, start, done, chain['cpu'], own),
+        columns(of, after_vertex, onward, done, after, 0, pool.place_of_vertex[after_vertex])])
+    spans = spans[spans['end'] > spans['begin']]
+    return spans[np.lexsort((spans['begin'], spans['miss']))]
+
+
+def _ran_long(spans: Table, more: Ints, usual: Usual, pool: Pool) -> Ints:
+    """Split the time beyond the usual execution times."""
+    times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
+    cpu, vertex = spans['more'], spans['vertex']
+    computed = np.maximum(0, cpu - usual.cpu[vertex])
+    starved = (cpu >= 0) & (2 * usual.cpu[vertex] >= usual.runs[vertex]) & (2 * computed < more)
+    idle = np.where(starved, more - computed, 0)
+    times[:, RAN_LONG] = more - idle
+    times[:, INTERPRETER] = np.minimum(
+        idle, pool.shared.within(spans['begin'], spans['end']))
+    times[:, MACHINE] = idle - times[:, INTERPRETER]
+    return times
+
+
+def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
+    """Split the waiting time, without stalls."""
+    times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
+    times[:, GROUP] = np.minimum(spans['more'], left)
+    left = left - times[:, GROUP]
+    if pool.threads is not None:
+        for thread in np.unique(spans['place']).tolist():
+            mine = np.flatnonzero(spans['place'] == thread)
+            # without an execution its thread is unknown
+            times[mine, WAITED] = left[mine] if thread not in pool.threads else np.minimum(
+                left[mine], pool.threads[thread].within(spans['begin'][mine], spans['end'][mine]))
+        idle, source = left - times[:, WAITED], is_source[spans['vertex']]
+        times[:, RELEASED_LATE] = np.where(source, idle, 0)
+        times[:, TRANSPORT] = np.where(source, 0, idle)
+        return times
+    if not pool.knows_workers:
+        times[:, WAITED] = left
+        return times
+    begins, ends = spans['begin'], spans['end']
+    times[:, WAITED] = np.minimum(left, pool.full.within(begins, ends))
+    left = left - times[:, WAITED]
+    some = pool.some.within(begins, ends) - times[:, WAITED] - times[:, GROUP]
+    times[:, INTERPRETER] = np.clip(some, 0, left)
+    left = left - times[:, INTERPRETER]
+    nothing = left >= _NOTHING_NS
+    times[nothing, MACHINE] = left[nothing]
+    times[~nothing, WAITED] += left[~nothing]
+    return times
+
+
+def _pending(
+    rows: Table, spans: Table, times: Ints, left: Ints, never: Never, pool: Pool, is_source: Any
+) -> None:
+    """
+    Find what callbacks that never ran were pending for: they waited, or ``Never.cause``.
+
+    A timer's skipped release waited if all workers were busy for most of the time; otherwise an
+    execution before it waited, or it was noticed late.  The part of a dropped execution ends with
+    the drop.
+    """
+    pending = np.flatnonzero(spans['kind'] == _PENDING)
+    started = never.started
+    started = started[np.isin(started['vertex'], spans['vertex'][pending]) & np.isin(
+        started['job'], rows['job'][spans['miss'][pending]])]
+    waiting = {(vertex, job): (ready, start, group) for vertex, job, ready, start, group in zip(
+        *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start', 'group')))}
+    before = never.waiting(spans['vertex'][pending], spans['end'][pending])
+    for i, waiting_job, miss, vertex, begin, end in zip(pending.tolist(), before.tolist(), *(
+            spans[name][pending].tolist() for name in ('miss', 'vertex', 'begin', 'end'))):
+        key = vertex, int(rows['job'][miss])
+        ready, start, group = waiting.get(key, (end, end, 0))
+        waits = ready < end <= start or never.why_dropped(key) == 'aborted'
+        if not waits and key not in never.dropped and (
+                rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
+            full, = pool.full.within(*(np.array([each]) for each in (begin, end)))
+            waits = pool.knows_workers and 2 * int(full) >= end - begin
+        if waits:
+            spans['kind'][i], spans['more'][i] = _WAIT, min(group, end - begin)
+        elif is_source[vertex] and key not in never.dropped:
+            times[i, SKIPPED if waiting_job >= 0 else RELEASED_LATE] = left[i]
+        else:
+            times[i, never.cause(key, begin, end)] = left[i]
+            if key in never.dropped:
+                spans['end'][i] = min(end, max(begin, never.dropped[key][1]))
+
+
+def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:
+    """Return which misses a stall or its backlog may have delayed."""
+    begin, end = stall
+    return (rows['release'] < 2 * end - begin) & (rows['until'] > begin)
+
+
+def _causes(
+    rows: Table, total: Ints, amounts: Ints, pool: Pool, never: Never, is_source: Any
+) -> Ints:
+    """Return the cause of each miss; ``amounts`` are the times that are compared."""
+    credit = np.zeros(len(rows), dtype=np.int64)    # time that the machine may have caused
+    for stall in pool.stalls:
+        credit[delayed_by(rows, stall)] += stall[1] - stall[0]
+    after_stall = credit > 0
+    for cause in (WAITED, INTERPRETER, GROUP, DEMOTED, LESS_IMPORTANT, RELEASED_LATE, TRANSPORT):
+        moved = np.minimum(credit, amounts[:, cause])
+        amounts[:, cause] -= moved
+        amounts[:, MACHINE] += moved
+        credit -= moved
+    causes: Ints = amounts.argmax(axis=1)
+    causes[rows['kind'] == SINK_FAILED] = FAILED
+    given_up = np.flatnonzero(
+        np.isin(rows['kind'], (SINK_EXPIRED, SINK_ABORTED))
+        & ((total[:, [*NO_MESSAGE, SKIPPED]].sum(axis=1) > 0) | (amounts.max(axis=1) == 0)))
+    causes[given_up] = _given_up(
+        rows, given_up, causes, np.where(after_stall, MACHINE, RELEASED_LATE), never, is_source)
+    return causes
+
+
+def _given_up(
+    rows: Table, which: Ints, causes: Ints, skipped: Ints, never: Never, is_source: Any
+) -> Ints:
+    """
+    Return the causes of misses whose jobs ended early.
+
+    :param causes: of all misses.
+    :param skipped: causes of skipped releases for which no execution waited.
+    """
+    found = causes[which]
+    kind, job, at, release, until = (
+        rows[name][which] for name in ('kind', 'job', 'at', 'release', 'until'))
+    dropped = np.array(
+        [key in never.dropped for key in zip(at.tolist(), job.tolist())], dtype=np.bool_)
+    skips = is_source[at] & ~dropped
+    for i in np.flatnonzero(~skips & (dropped | (kind == SINK_EXPIRED))).tolist():
+        found[i] = never.cause((int(at[i]), int(job[i])), int(release[i]), int(until[i]))
+    found[skips] = skipped[which[skips]]
+    before = never.waiting(at, until)
+    waits = skips & (before >= 0) & (found != MACHINE)
+    raised = rows['kind'] == SINK_FAILED     # a failure does not say why an execution waited
+    of = dict(zip(
+        zip(rows['sink'][~raised].tolist(), rows['job'][~raised].tolist()),
+        causes[~raised].tolist()))
+    found[waits] = [of.get(key, WAITED) for key in zip(
+        rows['sink'][which[waits]].tolist(), before[waits].tolist())]
+    return found
+
+
+def behind(
+    found: Found, runs: dict[tuple[int, int], Spans], on_workers: dict[tuple[int, int], Spans],
+    group_of: dict[int, int], groups: dict[int, int],
+) -> dict[int, list[tuple[int, int]]]:
+    """
+    Return by part the callbacks that ran while it waited, and how long, longest first.
+
+    :param runs: by callback and place (see ``Pool``) when it ran; ``on_workers``: when its
+        executions occupied a worker.  Only those at the place of the part count.
+    :param group_of: by vertex its callback group, ``groups``: by callback; -1: a reentrant one.
+    """
+    every, rows = found.parts, found.misses
+    share = 10 * every['ns'] >= (rows['until'] - rows['release'])[every['miss']]
+    chosen = np.flatnonzero(np.isin(every['cause'], _WAITS) & share)
+    waits: dict[int, list[tuple[int, int]]] = {}
+    for place in np.unique(every['place'][chosen]).tolist():
+        keys = [key for key in runs if key[1] == place]
+        callbacks = [callback for callback, _ in keys]
+        mine = chosen[every['place'][chosen] == place]
+        if not keys:
+            continue
+        parts = every[mine]
+        begins, ends = parts['begin'], parts['end']
+        times = np.array([runs[key].within(begins, ends) for key in keys])
+        waited = np.isin(parts['cause'], _ON_WORKERS)
+        times[:, waited] = [
+            on_workers[key].within(begins[waited], ends[waited]) for key in keys]
+        grouped = parts['cause'] == GROUP
+        for vertex in np.unique(parts['vertex'][grouped]).tolist():
+            others = [i for i, callback in enumerate(callbacks)
+                      if group_of.get(vertex, -1) != groups.get(callback, -2)]
+            times[np.ix_(others, np.flatnonzero(grouped & (parts['vertex'] == vertex)))] = 0
+        for part, column in zip(mine.tolist(), times.T):
+            order = np.argsort(-column, kind='stable')[:_MOST_BEHIND].tolist()
+            waits[part] = [(callbacks[i], int(column[i])) for i in order if column[i] > 0]
+    return waits

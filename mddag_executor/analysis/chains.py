@@ -1,0 +1,319 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Splits the response time of a job along its critical chain.
+
+Theory of operation
+-------------------
+The critical chain of a completed sink is found backwards. A vertex became ready when the last
+message that it needed arrived; the vertex that published this message is the previous link; the
+first link is the source.  The response time (completion minus release) is the sum of:
+
+* release lag: from the release until the source was ready (timer latency or, with `release_from:
+  header_stamp`, the transport of the sensor's message);
+* waiting: from ready to the start of the execution, for a worker or for the callback group (while
+  another callback of the group ran);
+* executing: from the start until the next vertex was ready or the execution ended, whichever was
+  first;
+* suspended: the gaps within an execution in which a coroutine waited;
+* transport: from the end of an execution until the next vertex was ready;
+* unknown: the time before the first recorded link.
+
+An execution of a driven sync (``driven_by``) may have been ready before the driving message was
+published.  Its waiting counts from that publication.
+
+A vertex has one execution in a job: the one that completed it, otherwise the last one that started
+before the job ended.  If that one never completed, it is unknown when it ended and which message
+started it; the message of the publisher that ended last is assumed.
+
+So the chain up to a vertex does not depend on the sink.  The parts are summed for all jobs of a
+DAG at once, vertex by vertex, in topological order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from mddag_executor.analysis.deadlines import Judged
+from mddag_executor.core import legs_of, NEVER
+from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
+from mddag_executor.recording.columns import concatenate, rows, Table
+from mddag_executor.recording.tables import EXECUTIONS, Ints, LEG, Mask, rows_by, sort_by
+from msg_graph import TaskSet
+from msg_graph.model import topological_order
+import numpy as np
+
+LINKS = np.dtype([
+    ('of', 'i8'), ('vertex', 'i8'), ('leg', 'i8'), ('ready', 'i8'), ('start', 'i8'),
+    ('end', 'i8'), ('busy', 'i8'), ('group', 'i8'), ('cpu', 'i8'), ('row', 'i8')])
+"""
+Columns of a link of a chain.
+
+``of`` is the number of the chain; ``leg`` is the leg that completed the vertex (-1: it never
+completed). Times of the execution: ready, first start, last end, total time of its pieces, waiting
+for the callback group, CPU time (-1: unknown), ns; ``row`` of the execution.
+"""
+
+_USED = ['completes', 'leg', 'ready', 'began', 'end', 'busy', 'cpu']
+"""The columns of executions that links have."""
+
+
+class _Chain(NamedTuple):
+    """
+    The chains of all jobs of a DAG up to the execution of one vertex.
+
+    :ivar known: whether there is an execution; its ``start``, ``end`` and ``pause`` (all gaps).
+    :ivar first: when the first link was ready; ``is_whole``: whether it is the source.
+    :ivar sums: waiting, executing, suspended, waiting for groups, up to the start.
+    """
+
+    known: Mask
+    start: Ints
+    end: Ints
+    pause: Ints
+    first: Ints
+    is_whole: Mask
+    sums: Ints
+
+    def until(self, time: Ints) -> Ints:
+        """Return the sums up to a time: the next vertex was ready, or the sink ended."""
+        published = np.minimum(self.end, time)
+        # where in the execution a pause was is not recorded: it counts as far as it fits
+        pause = np.maximum(0, np.minimum(self.pause, published - self.start))
+        sums = self.sums.copy()
+        sums[1] += published - self.start - pause
+        sums[2] += pause
+        return sums
+
+    def after(self, before: _Chain, ready: Ints) -> tuple[Mask, _Chain]:
+        """Return which jobs have this link after the chains of publishers, and the chains."""
+        good = self.known & before.known & (before.start <= ready)
+        return good, self._replace(
+            first=np.where(good, before.first, self.first), is_whole=good & before.is_whole,
+            sums=self.sums + np.where(good, before.until(ready), 0))
+
+
+class Chains:
+    """
+    The chains of a judged recording.
+
+    :ivar waited: by execution how long its first piece waited for its callback group, ns.
+    """
+
+    def __init__(self, judged: Judged, executions: Table, waited: Ints) -> None:
+        if not len(executions):     # row -1 must exist
+            executions, waited = rows(EXECUTIONS, 1, vertex=-1), np.zeros(1, dtype=np.int64)
+        self._judged, self._executions, self.waited = judged, executions, waited
+        self._first = judged.tables.first_vertex
+        #: By DAG, vertex and leg the vertex that publishes its message.
+        self._legs = [
+            [[before for _, before in legs_of(vertex, dag.vertices)] for vertex in dag.vertices]
+            for dag in judged.task_set.dags]
+        #: By DAG and vertex whether it is a driven sync.
+        self._is_driven = [
+            np.array([vertex.callback.driven_by is not None for vertex in dag.vertices])
+            for dag in judged.task_set.dags]
+        # the last one is -1, none
+        self._started = np.append((executions['vertex'] >= 0) & (executions['start'] >= 0), False)
+        self._is_other = self._started.copy()
+        for jobs in judged.jobs:
+            self._is_other[jobs.done] = False
+        self._dags: dict[int, tuple[Any, Any]] = {}
+        self._breakdown: dict[int, dict[str, Any]] = {}
+
+    # --- links -----------------------------------------------------------------------------------
+
+    @cached_property
+    def _others(self) -> list[Ints]:
+        """Return by DAG the executions that completed no vertex, in the order of their starts."""
+        table, which = self._executions, np.flatnonzero(self._is_other)
+        which = which[sort_by(table['start'][which])]
+        return [which[mine] for mine in rows_by(table['dag'][which], len(self._legs))]
+
+    def _rows(self, dag: int) -> Any:
+        """Return by vertex and job the row of the execution, -1: none."""
+        jobs, others = self._judged.jobs[dag], self._others[dag]
+        found = jobs.done.T.copy()
+        found[~self._started[found]] = -1       # only its completion is recorded
+        table = self._executions[['job', 'vertex', 'start']][others]
+        job, vertex = jobs.rows_of(table['job']), table['vertex'] - self._first[dag]
+        mine = np.flatnonzero(job >= 0)
+        mine = mine[(table['start'][mine] <= jobs.until[job[mine]]) & (
+            found[vertex[mine], job[mine]] < 0)]
+        found[vertex[mine], job[mine]] = others[mine]       # the last one is written last
+        return found
+
+    def _links(self, dag: int, vertex: Any, row: Ints) -> Table:
+        """Return executions of vertices as links."""
+        table = self._executions[_USED][row]
+        n_legs = np.array([max(1, len(legs)) for legs in self._legs[dag]])[vertex]
+        # a sync waits for its other messages
+        running = self._is_other[row] & (table['completes'] != LEG)
+        known = (table['leg'] >= 0) & (table['leg'] < n_legs)   # otherwise the last one
+        found = rows(
+            LINKS, len(row), vertex=vertex + self._first[dag], ready=table['ready'],
+            start=table['began'], group=self.waited[row], row=row,
+            leg=np.where(running, -1, np.where(known, table['leg'], n_legs - 1)),
+            cpu=np.where(running, -1, table['cpu']))
+        for name in ('end', 'busy'):
+            found[name] = np.where(running, NEVER, table[name])
+        return found
+
+    def _of_dag(self, dag: int) -> tuple[Any, Any]:
+        """
+        Find the chains of a DAG, and the breakdown of its sinks.
+
+        :return: by vertex and job the row of the execution, and the previous vertex of the chain;
+            -1: none.
+        """
+        if dag in self._dags:
+            return self._dags[dag]
+        task, row = self._judged.task_set.dags[dag], self._rows(dag)
+        before = np.full(row.shape, -1, dtype=np.int16)
+        self._dags[dag] = row, before
+        chains: dict[int, _Chain] = {}
+        for v in topological_order(task):
+            links, legs = self._links(dag, v, row[v]), self._legs[dag][v]
+            ready, start, end, leg = (
+                links[name].copy() for name in ('ready', 'start', 'end', 'leg'))
+            pause = np.where(leg < 0, 0, end - start - links['busy'])
+            zero = np.zeros_like(ready)
+            chain = _Chain(
+                row[v] >= 0, start, end, pause, ready, np.ones_like(ready, np.bool_),
+                np.array([start - ready, zero, zero, links['group']]))
+            if legs:
+                leg, published = _published([chains[each] for each in legs], leg, ready)
+                if self._is_driven[dag][v]:
+                    ready = np.where(published.known, _answers_from(
+                        ready, start, published.end), ready)
+                    chain.sums[0] = start - ready
+                good, chain = chain.after(published, ready)
+                before[v] = np.where(good, np.array(legs)[leg], -1)
+            if v in task.sinks:
+                self._add_breakdown(dag, v, chain)
+            chains[v] = chain
+        return row, before
+
+    def _follow(self, dag: int, which: Ints, vertex: Ints, job: Ints) -> Iterator[Table]:
+        """Yield the links of chains from last to first; ``which``: numbers of the chains."""
+        row, before = self._of_dag(dag)
+        while len(which):
+            links = self._links(dag, vertex, row[vertex, job])
+            links['of'] = which
+            driven, vertex = self._is_driven[dag][vertex], before[vertex, job]
+            ended = self._executions['end'][row[vertex, job]]
+            links['ready'] = np.where(driven & (vertex >= 0), _answers_from(
+                links['ready'], links['start'], ended), links['ready'])
+            yield links
+            more = vertex >= 0
+            which, vertex, job = which[more], vertex[more], job[more]
+
+    # --- misses ----------------------------------------------------------------------------------
+
+    def of_misses(self, dag: int, missed: Table) -> tuple[Ints, Table]:
+        """
+        Return the chains of the misses of a DAG, as far as their jobs got.
+
+        :param missed: verdicts.
+        :return: the last vertex that each job reached, and the links; ``of`` is the row in
+            ``missed``.
+        """
+        legs = self._legs[dag]
+        width = max(1, *map(len, legs))
+        before = np.array([each + [-1] * (width - len(each)) for each in legs])
+        row = self._of_dag(dag)[0][:, missed['row']].T
+        row[self._executions['began'][row] > missed['until'][:, None]] = -1
+        end = np.where(self._is_other[row], NEVER, self._executions['end'][row])
+        every, at = np.arange(len(missed)), missed['sink'] - self._first[dag]
+        back = np.flatnonzero(missed['kind'] != SINK_LATE)
+        while len(back):
+            publishers = before[at[back]]
+            missing = (publishers >= 0) & (row[back[:, None], publishers] < 0)
+            some = missing.any(axis=1)
+            back, first = back[some], missing[some].argmax(axis=1)
+            at[back] = publishers[some, first]
+        # the last message that the vertex waited for
+        publishers = before[at]
+        ends = np.where((publishers >= 0) & (row[every[:, None], publishers] >= 0),
+                        end[every[:, None], publishers], -1)
+        waits = (row[every, at] < 0) & (publishers[:, 0] >= 0)
+        last = np.where(waits, publishers[every, ends.argmax(axis=1)], at)
+        which = np.flatnonzero(row[every, last] >= 0)
+        found = list(self._follow(dag, which, last[which], missed['row'][which]))
+        return at + self._first[dag], concatenate([rows(LINKS), *found])
+
+    # --- breakdown -------------------------------------------------------------------------------
+
+    def breakdown(self) -> dict[int, dict[str, Any]]:
+        """Return by sink the breakdown of its completed jobs: means, and the worst job."""
+        for dag in range(len(self._legs)):
+            self._of_dag(dag)
+        return self._breakdown
+
+    def _add_breakdown(self, dag: int, v: int, chain: _Chain) -> None:
+        """Break down the response times of a sink."""
+        sink = self._first[dag] + v
+        done = self._judged.of_sink(sink)
+        done = done[done['kind'] <= max(SINK_COMPLETED)]
+        if not len(done):
+            return
+        job, completed, n = done['row'], done['completed'], len(done)
+        took = completed - done['release']
+        columns: Any = [each[..., job] for each in chain]
+        chain = _Chain(*columns)
+        waiting, executing, suspended, group = np.where(chain.known, chain.until(completed), 0)
+        first = np.where(chain.known, chain.first, completed)
+        lag = np.where(chain.known & chain.is_whole, first - done['release'], 0)
+        parts = {
+            'release_lag_ns': lag, 'waiting_ns': waiting, 'executing_ns': executing,
+            'suspended_ns': suspended,
+            'transport_ns': completed - first - waiting - executing - suspended,
+            'unknown_ns': first - done['release'] - lag, 'waiting_group_ns': group}
+        worst = int(took.argmax())
+        links = self._follow(
+            dag, np.flatnonzero(chain.known[worst:worst + 1]), np.array([v]),
+            job[worst:worst + 1])
+        self._breakdown[sink] = {
+            'mean': {name: round(int(part.sum()) / n) for name, part in parts.items()},
+            'worst': {
+                'job': int(done['job'][worst]), 'release_ns': int(done['release'][worst]),
+                'completed_ns': int(completed[worst]),
+                **{name: int(part[worst]) for name, part in parts.items()},
+                'chain': [_step_result(self._judged.task_set, each[0]) for each in links][::-1]}}
+
+
+def _published(several: Sequence[_Chain], leg: Ints, ready: Ints) -> tuple[Ints, _Chain]:
+    """
+    Return by job the leg whose message started a vertex, and the chain of its publisher.
+
+    :param several: chains of the publishers of all legs.
+    :param leg: -1: unknown; ``ready``: when the vertex was ready.
+    """
+    found = several[0]
+    if len(several) > 1:
+        ended = [np.where(each.known & (each.start <= ready), each.end, -1) for each in several]
+        leg = np.where(leg < 0, np.argmax(ended, axis=0), leg)
+        for number, each in enumerate(several):
+            found = _Chain(*(np.where(leg == number, new, old) for new, old in zip(each, found)))
+    return np.maximum(leg, 0), found
+
+
+def _answers_from(ready: Ints, start: Ints, published: Ints) -> Ints:
+    """
+    Return from when on executions of a driven sync wait to complete a job.
+
+    The message of another topic may have come before the driving message was published.
+    """
+    found: Ints = np.maximum(ready, np.minimum(published, start))
+    return found
+
+
+def _step_result(task_set: TaskSet, link: Any) -> dict[str, Any]:
+    known = link['leg'] >= 0
+    return {
+        'vertex': task_set.vertices[int(link['vertex'])].name, 'ready_ns': int(link['ready']),
+        'start_ns': int(link['start']), 'end_ns': int(link['end']) if known else None,
+        'busy_ns': int(link['busy']) if known else None,
+        'waiting_group_ns': int(link['group']) if known else None}

@@ -1,0 +1,50 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Executions of callbacks and transport of messages in an imported recording."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mddag_executor.analysis.spread import spread, sum_of
+from mddag_executor.recording.tables import different, Recording, rows_by
+import numpy as np
+
+
+def recorded_callbacks(recording: Recording) -> dict[str, dict[str, int]]:
+    """Return counts and times (ns) of each recorded callback that ran."""
+    start, end = (recording.executions[name] for name in ('start', 'end'))
+    numbers, index = different(recording.executions['callback'])
+    found = {}
+    for number, mine in zip(numbers.tolist(), rows_by(index, len(numbers))):
+        ended = mine[end[mine] >= 0]
+        took = end[ended] - start[ended]
+        found[recording.who.name(number), number] = {
+            'executions': len(took), 'unfinished': len(mine) - len(took),
+            'busy_ns': sum_of(took), 'shortest_ns': int(took.min()) if len(took) else 0,
+            'longest_ns': max(0, int(took.max(initial=0)))}
+    return {label: each for (label, _), each in sorted(found.items(), key=lambda item: item[0])}
+
+
+def communications(recording: Recording) -> list[dict[str, Any]]:
+    """Return by publisher and callback the messages, and times from publication to start."""
+    table, messages, found = recording.executions, recording.publications, []
+    started = np.flatnonzero(table['message'] >= 0)
+    message = messages[table['message'][started]]
+    known = (message['publisher'] >= 0) & (message['time'] > 0)
+    started, message = started[known], message[known]
+    publishers, publisher_of = different(message['publisher'])
+    pairs, which = different(
+        recording.callbacks()[1][started].astype(np.int64) * len(publishers) + publisher_of)
+    latency = table['start'][started] - message['time']
+    sent = dict(zip(*(each.tolist() for each in np.unique(
+        messages['publisher'], return_counts=True))))
+    for mine in sorted(rows_by(which, len(pairs)), key=lambda each: int(each[0])):
+        number = int(message['publisher'][mine[0]])
+        publisher = recording.who.every_publisher[number]
+        found.append({
+            'topic': publisher.topic,
+            'publisher': publisher.node.name if publisher.node is not None else None,
+            'callback': recording.who.name(int(table['callback'][started[mine[0]]])),
+            'sent': sent[number], 'arrived': len(mine), 'latency_ns': spread(latency[mine])})
+    return sorted(found, key=lambda each: (each['topic'], each['callback']))

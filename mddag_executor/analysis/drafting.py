@@ -1,0 +1,410 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Drafts systems from traces: nodes, callbacks, published topics, rates, execution times.
+
+Theory of operation
+-------------------
+1. The tables of the recording have the executions and publications.  Entities of every node
+   (parameter services and the like) are ignored, and so are nodes without others.
+2. A coroutine is one execution, however often it was resumed.
+3. A callback in the recorded declaration keeps its name and the declared properties that a trace
+   does not show: deadline, queue edges, period, sync, group, name of the DAG.  Other callbacks are
+   named by their recorded function, otherwise ``callback_0``, ``callback_1``, … by node, in the
+   order of creation.
+4. A topic of a node is published by the callbacks that were seen to publish it. If none was, every
+   callback of the node may publish it; for a node without callbacks a timer is assumed.
+5. A service without calls, and a subscription without messages whose topic no callback publishes,
+   have no rate, so they cannot be the source of a DAG.  They are left out and reported.
+6. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
+   that completed it: the others only store a message.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+import os
+from typing import NamedTuple
+
+from mddag_executor.core import quantile
+from mddag_executor.errors import InputError
+from mddag_executor.recording.entities import Callback, KINDS
+from mddag_executor.recording.head import is_declared
+from mddag_executor.recording.mapping import declared_keys
+from mddag_executor.recording.tables import Ints, Mask, Recording, rows_by, sort_by, VERTEX
+from mddag_executor.sources.head import named_errors, read_head
+from mddag_executor.sources.open import open_recording
+from mddag_executor.trace import TraceReader
+from msg_graph import Callback as Declared
+from msg_graph import ExecutionTime, NO_GRAPH, TaskSet
+from msg_graph.binding import function_of, is_background
+from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath, leave_out_sources
+from msg_graph.duration import DAY, exact_duration
+from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
+import numpy as np
+
+PERCENT = (0.0, 50.0, 90.0, 99.0, 100.0)
+LEAST_SILENT, LEAST_SILENT_SHARE = 2, 0.02
+"""A callback publishes only sometimes if more executions, and a larger share, were silent."""
+DRIVEN_SHARE = 0.15
+"""The largest difference of two numbers of executions that count as equal."""
+STORES_NS = 500_000
+"""A callback that only stores its message takes no longer in nine of ten executions."""
+IRREGULAR = 3
+"""Times between executions are irregular if one in ten is so many times another one in ten."""
+ONCE_PERIODS = 3
+"""A timer fires once if it was silent for so many periods after its only execution."""
+
+
+class Runs(NamedTuple):
+    """
+    The executions of a callback.
+
+    :ivar starts: of each, ns; ``times``: how long each took, all pieces together.
+    :ivar whole: which of them completed a vertex.
+    :ivar topics: what they published on, in the order of time.
+    :ivar published: by topic, in how many executions it was published.
+    """
+
+    starts: Ints
+    times: Ints
+    whole: Mask
+    topics: list[str]
+    published: dict[str, int]
+
+
+class System:
+    """
+    The recorded system, as far as a trace shows it.
+
+    :param path: a trace of this executor, or an imported recording of CARET or ros2_tracing.
+    :ivar warnings: missing data of the trace, one line each.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], name: str | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> None:
+        self.name = name or os.fspath(path)
+        with named_errors(os.fspath(path), self.name):
+            reader = TraceReader(path)
+            head = read_head(reader)
+            graph = None if head is None or is_declared(head) else NO_GRAPH
+            recording = open_recording(reader, graph, self.name, progress)
+        declared = recording.declared
+        self.task_set: TaskSet | None = recording.task_set if declared else None
+        self.workers: int | None = recording.head.workers if declared else None
+        self.warnings = list(reader.warnings)
+        self._process_names = recording.process_names
+        self._who = recording.who
+        self._end = recording.end
+        self._entities = [entity for entity in sorted(
+            self._who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
+        if not self._entities:
+            raise InputError(
+                self.name, 'no timer, subscription or service of a node is recorded in it',
+                'also record the start of the nodes')
+        # by callback's number
+        numbers, index = recording.callbacks()
+        self._declared: dict[int, Declared] = {
+            number: recording.task_set.vertices[vertex].callback for number, vertex in zip(
+                numbers.tolist(), recording.vertices_of_callbacks().tolist()) if vertex >= 0}
+        # those of the other topics of a driven sync run as no vertex
+        for number, key in declared_keys(self._who, recording.recorded_set).items():
+            if number not in self._declared and (
+                    callback := recording.recorded_set.callback(key)).driven_by is not None:
+                self._declared[number] = callback
+        self._runs = {number: _runs_of(recording, chosen) for number, chosen in zip(
+            numbers.tolist(), rows_by(index, len(numbers)))}
+        self._find_publishers(recording)
+
+    def _find_publishers(self, recording: Recording) -> None:
+        """Find the topics of callbacks and nodes."""
+        #: By node its published topics, and whether a callback was seen to publish them.
+        self._publishers: dict[str, dict[str, bool]] = {
+            name: {} for name in self._who.names_of_nodes}
+        publishers = self._who.every_publisher
+        for publisher in publishers.values():
+            if publisher.node is not None:
+                self._publishers[publisher.node.name][publisher.topic] = False
+        sent = recording.publications[recording.publications['execution'] >= 0]
+        pairs = np.stack((recording.executions['callback'][sent['execution']], sent['publisher']))
+        different, first, pair = np.unique(pairs, axis=1, return_index=True, return_inverse=True)
+        several = np.unique(np.stack((pair.reshape(-1), sent['execution'])), axis=1)
+        counts = np.bincount(several[0].astype(np.int64), minlength=len(first))
+        by_time = np.argsort(first)
+        for (callback, number), count in zip(
+                different.T[by_time].tolist(), counts[by_time].tolist()):
+            known = publishers.get(number)
+            if known is not None:
+                runs = self._runs[callback]
+                runs.topics.append(known.topic)
+                runs.published[known.topic] = runs.published.get(known.topic, 0) + count
+                if known.node is not None:
+                    self._publishers[known.node.name][known.topic] = True
+
+    def draft(self) -> Draft:
+        """Return the whole system."""
+        nodes: dict[str, DraftNode] = {}
+        for entity in self._entities:
+            node = nodes.setdefault(entity.node_name, DraftNode(entity.node_name))
+            callback = self._callback(entity, node)
+            node.callbacks.setdefault(callback.name, callback)
+        for name, topics in self._publishers.items():
+            unseen = [t for t, seen in topics.items()
+                      if not seen and not is_background(t, name) and TOPIC.fits(t)]
+            if unseen and name not in nodes and NODE.fits(name):
+                timer = DraftCallback(name, 'callback_0', 'timer')
+                nodes[name] = DraftNode(name, {timer.name: timer})
+            if unseen:
+                for callback in nodes[name].callbacks.values() if name in nodes else ():
+                    callback.maybe.extend(t for t in unseen if t not in callback.publishes)
+        for node in nodes.values():
+            self._find_driven(node)
+            _find_stores(node)
+        draft = Draft(
+            f'the trace {self.name}', self._ordered(nodes), self._paths(nodes), self.workers)
+        declared = {callback.key for callback in self._declared.values()}
+        leave_out_sources(draft, lambda callback: (
+            callback.runs == 0 and callback.kind != 'timer' and callback.key not in declared),
+            'it never ran')
+        draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
+        return draft
+
+    def _find_driven(self, node: DraftNode) -> None:
+        """
+        Join the subscriptions of a node that publish one topic at the rate of one of them.
+
+        They are a sync of different rates if several of them publish the topic, and together as
+        often as one of them runs.
+        """
+        declared = {callback.key for callback in self._declared.values()}
+        subscriptions = [each for each in node.callbacks.values()
+                         if each.kind == 'subscription' and each.key not in declared]
+        topics = dict.fromkeys(topic for each in subscriptions for topic in each.publishes)
+        for topic in topics:
+            several = [each for each in subscriptions if topic in each.publishes
+                       and each.kind == 'subscription' and each.name in node.callbacks]
+            runs = [each.runs or 0 for each in several]
+            if len({each.starts[0] for each in several}) < 2 or (
+                    max(runs) - min(runs) <= DRIVEN_SHARE * max(runs)):
+                continue
+            total = sum(_published_by(each, topic) for each in several)
+            driver = min(several, key=lambda each: abs((each.runs or 0) - total))
+            if abs((driver.runs or 0) - total) <= max(LEAST_SILENT, DRIVEN_SHARE * total):
+                _join(node, driver, [each for each in several if each is not driver], topic, total)
+
+    def _processes(self, nodes: list[str]) -> dict[str, list[str]]:
+        """Return the given nodes of each process; none if there is one process."""
+        pids = {entity.node.name: entity.node.pid for entity in reversed(self._entities)
+                if entity.node is not None}
+        found: dict[str, list[str]] = {}
+        for node in nodes:
+            if pids.get(node) in self._process_names:
+                found.setdefault(self._process_names[pids[node]], []).append(node)
+        return found if len(found) > 1 else {}
+
+    def _ordered(self, nodes: dict[str, DraftNode]) -> list[DraftNode]:
+        """
+        Return the nodes in the order of the recorded declaration, which decides ties.
+
+        Others are sorted by name: an executor's nodes are recorded in any order.
+        """
+        by_name = [nodes[name] for name in sorted(nodes)]
+        if self.task_set is None:
+            return by_name
+        place = self.task_set.places()
+        every = [callback for node in by_name for callback in node.callbacks.values()]
+        found: list[DraftNode] = []
+        for callback in sorted(every, key=lambda c: place.get(c.key, len(place))):
+            if not found or found[-1].name != callback.node:
+                found.append(DraftNode(callback.node))  # a node may have several entries
+            found[-1].callbacks[callback.name] = callback
+        return found
+
+    def _paths(self, nodes: dict[str, DraftNode]) -> list[DraftPath]:
+        """Return the declared paths, as far as each step was recorded."""
+        every = {c.key: c for node in nodes.values() for c in node.callbacks.values()}
+        return [
+            DraftPath(path.name, [], list(path.callbacks), {
+                **{what: exact_duration(time) for what, time in path.requirements.items()},
+                **({} if path.tolerate is None else {'tolerate': str(path.tolerate)})})
+            for path in (self.task_set or NO_GRAPH).paths
+            if every.keys() >= set(path.callbacks) and all(
+                not {*before.publishes, before.name}.isdisjoint(after.starts + after.reads)
+                for before, after in pairwise(every[key] for key in path.callbacks))]
+
+    def _callback(self, entity: Callback, node: DraftNode) -> DraftCallback:
+        declared = self._declared.get(entity.number)
+        if declared is not None and declared.node == entity.node_name:
+            known = node.callbacks.get(declared.name)
+            callback = known or _from_declared(declared)
+        else:
+            callback = DraftCallback(
+                entity.node_name, self._free_name(entity, node), entity.kind,
+                [entity.start] if entity.start else [],
+                entity.period if entity.kind == 'timer' and entity.period <= DAY else None)
+            callback.group = self._group_name(entity)
+        self._measure(callback, entity)
+        return callback
+
+    def _free_name(self, entity: Callback, node: DraftNode) -> str:
+        """Return a free name for a callback without name."""
+        declared = () if self.task_set is None else self.task_set.callbacks
+        taken = {*node.callbacks, *(c.name for c in declared if c.node == entity.node_name)}
+        name = function_of(entity.symbol)
+        if name is None or not CALLBACK.fits(name):
+            names = [f'callback_{number}' for number in range(len(taken), 2 * len(taken) + 1)]
+        else:
+            names = [name, *(f'{name}_{number}' for number in range(2, len(taken) + 2))]
+        return next(each for each in names if each not in taken)
+
+    def _group_name(self, entity: Callback) -> str | None:
+        """Return a name for a group that several callbacks of the node share."""
+        groups = [e.group for e in self._entities
+                  if e.node_name == entity.node_name and e.group not in (None, -1)]
+        if entity.group is None or groups.count(entity.group) < 2:
+            return None
+        return f'callback_group_{list(dict.fromkeys(groups)).index(entity.group)}'
+
+    def _measure(self, callback: DraftCallback, entity: Callback) -> bool:
+        """Fill in the measured values of a callback; return whether there are any."""
+        runs = self._runs.get(entity.number)
+        count = 0 if runs is None else len(runs.starts)
+        callback.runs = (callback.runs or 0) + count
+        if runs is None or not count:
+            return False
+        callback.publishes.extend(
+            t for t in dict.fromkeys(runs.topics)
+            if t not in callback.publishes and not is_background(t, callback.node)
+            and TOPIC.fits(t))
+        callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
+        if callback.kind != 'sync':     # each of its messages runs it, and one of them publishes
+            silent = {topic: count - n for topic, n in runs.published.items()}
+            callback.sometimes.update({
+                topic: (runs.published[topic], count) for topic in callback.publishes
+                if silent.get(topic, 0) > max(LEAST_SILENT, LEAST_SILENT_SHARE * count)})
+        if callback.kind == 'timer' and count == 1 and (
+                self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
+            callback.also['once'] = 'true'
+        if callback.kind == 'sync':
+            legs = [self._runs[number] for number, declared in self._declared.items()
+                    if declared.key == callback.key]
+            callback.times = execution_time(np.concatenate(
+                [leg.times[leg.whole] for leg in legs or [runs]]))
+        else:
+            callback.interval_ns = int(np.ptp(runs.starts)) // (count - 1) if count > 1 else None
+            between = np.sort(np.diff(np.sort(runs.starts)))
+            if count > IRREGULAR and callback.kind != 'timer' and (
+                    between[len(between) * 9 // 10] > IRREGULAR * between[len(between) // 10]):
+                callback.least_interval_ns = max(1_000, int(between[0]))
+            callback.times = execution_time(runs.times)
+        return True
+
+    def measure(self, draft: Draft) -> int:
+        """
+        Fill measured values into a draft of the same system; return the number of callbacks.
+
+        Callbacks are matched by node and trigger; of several with the same trigger by the order of
+        creation.
+        """
+        waiting: dict[tuple[str, str, str], list[Callback]] = {}
+        for entity in self._entities:
+            start = str(entity.period) if entity.kind == 'timer' else entity.start
+            waiting.setdefault((entity.node_name, entity.kind, start), []).append(entity)
+        count = 0
+        for callback in draft.callbacks():
+            start = callback.starts[0] if callback.starts else str(callback.period_ns)
+            fits = waiting.get((callback.node, callback.kind, start))
+            if fits:
+                count += self._measure(callback, fits.pop(0))
+        return count
+
+
+def _published_by(callback: DraftCallback, topic: str) -> int:
+    """Return in how many executions a callback published a topic that it has published."""
+    counts = callback.sometimes.get(topic)
+    return counts[0] if counts is not None else (callback.runs or 0)
+
+
+def _join(
+    node: DraftNode, driver: DraftCallback, others: list[DraftCallback], topic: str, total: int
+) -> None:
+    """Make one sync of subscriptions, which the topic of one of them drives."""
+    runs = driver.runs or 0
+    driver.why = (f'  # proposed: its executions published {topic} {total} times, and '
+                  f'{driver.starts[0]} came {runs} times')
+    published = {
+        each: sum(_published_by(c, each) for c in (driver, *others) if each in c.publishes)
+        for each in dict.fromkeys(t for c in (driver, *others) for t in c.publishes)}
+    driver.kind, driver.driven_by = 'sync', driver.starts[0]
+    driver.publishes = list(published)
+    driver.sometimes = {
+        each: (count, runs) for each, count in published.items()
+        if runs - count > max(LEAST_SILENT, DRIVEN_SHARE * runs)}
+    for other in others:
+        driver.starts += other.starts
+        if other.times is not None and (driver.times is None or (
+                other.times[0].mean_ns > driver.times[0].mean_ns)):
+            driver.times = other.times
+        del node.callbacks[other.name]
+
+
+def _find_stores(node: DraftNode) -> None:
+    """Mark the subscriptions that seem to only store a message for another callback."""
+    for callback in node.callbacks.values():
+        others = [each for each in node.callbacks.values() if each is not callback]
+        callback.stores = (
+            callback.kind == 'subscription' and not callback.publishes
+            and callback.times is not None
+            and callback.times[0].draw(0.9) <= STORES_NS
+            and any(each.publishes for each in others))
+
+
+def _runs_of(recording: Recording, which: Ints) -> Runs:
+    """Return the executions of a callback: the chosen rows."""
+    table = recording.executions[which]
+    table = table[table['start'] >= 0]
+    table = table[sort_by(*(table[name] for name in ('vertex', 'job', 'ready', 'start')))]
+    first = np.flatnonzero(table['piece'] == 0)
+    last = np.append(first, len(table))[1:] - 1
+    return Runs(table['start'][first], table['busy'][last], table['completes'][last] == VERTEX,
+                [], {})
+
+
+def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:
+    """Return the execution time of a callback and the number of executions; None without any."""
+    times = np.sort(np.maximum(1, took[took >= 0])).tolist()
+    if not times:
+        return None
+    quantiles = tuple(quantile(times, share / 100) for share in PERCENT)
+    return ExecutionTime(quantiles, PERCENT), len(times)
+
+
+def _is_shown(entity: Callback) -> bool:
+    if not NODE.fits(entity.node_name):
+        return False
+    if entity.kind == 'timer':
+        return entity.period >= 1_000
+    name = TOPIC if entity.kind == 'subscription' else SERVICE
+    return not is_background(entity.start, entity.node_name) and name.fits(entity.start)
+
+
+def _from_declared(declared: Declared) -> DraftCallback:
+    starts = [declared.service] if declared.service else list(declared.topics)
+    also = {key: str(value).lower() for key, value, usual in (
+        ('on_late', declared.on_late, None),
+        ('keep', declared.keep, 'all'),
+        ('importance', declared.importance, 'normal'),
+        ('tolerate', declared.tolerate, None),
+        ('max_active_jobs', declared.max_active_jobs, None),
+        ('holds_interpreter', declared.holds_interpreter, None),
+        ('once', declared.once, False), ('sporadic', declared.sporadic, False),
+        ) if value != usual}
+    return DraftCallback(
+        declared.node, declared.name, declared.kind, starts, declared.period_ns,
+        list(declared.may_publish), [],
+        list(declared.reads), declared.group, declared.dag, declared.deadline_ns,
+        declared.release_from, also=also, judged=declared.judged, driven_by=declared.driven_by,
+        sometimes=dict.fromkeys(declared.may_publish))

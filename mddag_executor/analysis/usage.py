@@ -1,0 +1,273 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+How much time callbacks and workers used: executions, busy time, waiting, CPU time.
+
+Theory of operation
+-------------------
+1. An execution of a declared callback counts when it completes; its time so far always counts.
+2. A callback uses the whole time of its executions, even if the recording is a part of a longer
+   one and they began before it or ended after it.
+3. The workers are busy while they run callbacks, within the span of the recording: each at most
+   all of the time.  A callback that another one runs while it waits (an imported one that spins)
+   uses the time of the same worker.  A callback that has lent its worker (``Client.call``) uses
+   none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from mddag_executor.analysis.spans import Spans
+from mddag_executor.recording.columns import in_parts, Table
+from mddag_executor.recording.tables import (
+    different,
+    Ints,
+    later_pieces,
+    NOTHING,
+    Recording,
+    rows_by,
+    sort_by,
+    UNKNOWN,
+)
+import numpy as np
+
+NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
+         'waiting_group_ns', 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter')
+"""The columns of a callback; the last four are of executions with known CPU time."""
+_MEASURED = NAMES.index('measured')
+# Columns of executions that are summed: of all pieces, and of completed executions.
+_TIMES = ['vertex', 'piece', 'ready', 'start', 'end']
+_TOTALS = ['vertex', 'busy', 'cpu', 'holds_gil']
+
+
+def ran(table: Table) -> Ints:
+    """Return the rows of ``executions`` that have a start and an end, in order of their ends."""
+    rows = np.flatnonzero((table['start'] >= 0) & (table['end'] >= 0))
+    end = table['end'][rows]
+    if (end[1:] < end[:-1]).any():
+        rows = rows[sort_by(end)]
+    return rows
+
+
+def in_groups(recording: Recording) -> Iterator[tuple[int, Ints, Ints, Ints]]:
+    """
+    Yield mutually exclusive groups, and rows, starts and ends of their executions that started.
+
+    They are in the order of ends; open ones come last, and end with the recording.
+    """
+    table, known = recording.executions, recording.who.groups
+    if max(known.values(), default=UNKNOWN) < 0:
+        return
+    rows = np.r_[ran(table), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
+    callbacks, which = recording.callbacks()
+    group = np.array([known.get(each, UNKNOWN) for each in callbacks.tolist()], np.int64)[
+        which[rows]]
+    numbers, which = different(group)
+    for number, mine in zip(numbers.tolist(), rows_by(which, len(numbers))):
+        if number >= 0:
+            members = rows[mine]
+            end = table['end'][members]
+            yield number, members, table['start'][members], np.where(
+                end < 0, recording.end, end)
+
+
+def group_waits(recording: Recording) -> Ints:
+    """
+    Return by execution how long its group was busy while it waited, ns.
+
+    Only callbacks of mutually exclusive groups wait for them.  The first piece of an execution
+    waits; all of its rows have the value.
+    """
+    table = recording.executions
+    waited = np.zeros(len(table), dtype=np.int64)
+    for _, rows, starts, ends in in_groups(recording):
+        ready = table['ready'][rows]
+        # only if the previous one ended after this one was ready
+        late = np.flatnonzero((np.r_[-1, ends[:-1]] > ready) & (table['piece'][rows] == 0))
+        if len(late):
+            waited[rows[late]] = Spans(starts, ends).within(ready[late], starts[late])
+    later, first = later_pieces(table)
+    waited[later] = waited[first]
+    return waited
+
+
+def worker_spans(
+    recording: Recording, begin: int, end: int, which: Any = True
+) -> dict[int, tuple[Ints, Ints]]:
+    """
+    Return by worker when it ran callbacks from ``begin`` to ``end``: starts and ends, ns (rule 3).
+
+    :param which: the executions that count.
+    """
+    table = recording.executions[['worker', 'start', 'end']]
+    rows = np.flatnonzero(
+        (table['worker'] >= 0) & (table['start'] >= 0) & (table['end'] > begin)
+        & (table['start'] < end) & which)
+    workers, number = different(table['worker'][rows])
+    found = {}
+    for worker, mine in zip(workers.tolist(), rows_by(number, len(workers))):
+        mine = rows[mine]
+        starts, ends = np.maximum(table['start'][mine], begin), np.minimum(table['end'][mine], end)
+        order = sort_by(starts)
+        starts, ends = starts[order], ends[order]
+        starts[1:] = np.maximum(starts[1:], np.maximum.accumulate(ends)[:-1])
+        found[worker] = starts[starts < ends], ends[starts < ends]
+    return found
+
+
+class PoolUse:
+    """
+    The load of the pool over time: in each step the busy time of all workers together.
+
+    Steps begin at multiples of their length.  With more than ``MOST_STEPS`` the length is doubled.
+
+    :param step: initial length, ns.
+    :param begin: when the recording begins, ns: if no worker was busy, the only step is there.
+    """
+
+    FIRST_STEP_NS = 100_000_000
+    MOST_STEPS = 600
+
+    def __init__(
+        self, starts: Ints, ends: Ints, step: int = FIRST_STEP_NS, begin: int | None = None
+    ) -> None:
+        self.step = step
+        self.start: int | None = None
+        self.busy: list[int] = []
+        spans = list(_spans(starts, ends))
+        if not spans:
+            if begin is not None:
+                self.start, self.busy = begin // step * step, [0]
+            return
+        first = min(int(start.min()) for start, _ in spans)
+        last = max(int(end.max()) for _, end in spans) - 1
+        while last // self.step - first // self.step >= self.MOST_STEPS:
+            self.step *= 2
+        number = first // self.step
+        self.start = number * self.step
+        steps = (number + np.arange(last // self.step - number + 2)) * self.step
+        busy = np.zeros(len(steps) - 1, dtype=np.int64)
+        for each in spans:
+            busy += Spans(*each).within(steps[:-1], steps[1:])
+        self.busy = busy.tolist()
+
+    def result(self) -> dict[str, Any]:
+        """Return the length of steps, the first begin, and the busy time of each, ns."""
+        return {'step_ns': self.step, 'start_ns': self.start, 'busy_ns': self.busy}
+
+
+def _spans(starts: Ints, ends: Ints) -> Iterator[tuple[Ints, Ints]]:
+    """Yield parts of the spans that are known and not empty."""
+    for start, end in zip(in_parts(starts), in_parts(ends)):
+        some = (start >= 0) & (start < end)
+        if some.any():
+            yield start[some], end[some]
+
+
+class Usage:
+    """
+    The time that callbacks and workers used in a recording.
+
+    :param waited: see ``group_waits``.
+    :param begin: the span of the workers' time begins; ``end``: ends.
+    """
+
+    def __init__(self, recording: Recording, waited: Ints, begin: int, end: int) -> None:
+        task_set = recording.task_set
+        self._places = task_set.places()
+        # by global vertex the index of its callback; the last entry is for undeclared ones
+        self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
+        self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)
+        self._duration = end - begin
+        table = recording.executions
+        for part, wait in zip(in_parts(table), in_parts(waited)):
+            ran = (part['start'] >= 0) & (part['end'] >= 0)
+            self._ran(part[_TIMES][ran], wait[ran])
+            self._completed(part[_TOTALS][ran & (part['completes'] != NOTHING) & (
+                part['vertex'] >= 0)])
+        #: How long workers ran declared callbacks, ns.
+        self.busy = sum(_busy(worker_spans(
+            recording, begin, end, table['vertex'] >= 0)).values())
+        spans = worker_spans(recording, begin, end)
+        #: By worker how long it ran callbacks, ns.
+        self.by_worker = _busy(spans)
+        self.pool = PoolUse(*in_one(spans), begin=begin)
+        lent = np.flatnonzero((table['worker'] < 0) & (table['start'] >= 0))
+        self._lent = int(np.maximum(0, np.minimum(table['end'][lent], end) - np.maximum(
+            table['start'][lent], begin)).sum())
+
+    def _ran(self, table: Table, waited: Ints) -> None:
+        vertex, start = table['vertex'], table['start']
+        took, place = table['end'] - start, self._place[vertex]
+        self._add('busy_ns', place, took)
+        first, undeclared = table['piece'] == 0, vertex < 0
+        self._add('executions', place[undeclared & first])
+        self._most('longest_ns', place[undeclared], took[undeclared])
+        place, wait = place[first], (start - table['ready'])[first]
+        self._add('waiting_ns', place, wait)
+        self._most('longest_wait_ns', place, wait)
+        self._add('waiting_group_ns', place, waited[first])
+
+    def _completed(self, table: Table) -> None:
+        place, busy = self._place[table['vertex']], table['busy']
+        self._add('executions', place)
+        self._most('longest_ns', place, busy)
+        known = table['cpu'] >= 0
+        if known.any():
+            place, table = place[known], table[known]
+            self._add('measured', place)
+            self._add('measured_busy_ns', place, table['busy'])
+            self._add('cpu_ns', place, table['cpu'])
+            self._add('held_interpreter', place, table['holds_gil'])
+
+    def _add(self, name: str, places: Ints, values: Any = None) -> None:
+        """Add values to callbacks by index; without values count them."""
+        column = self._table[NAMES.index(name)]
+        if values is None:
+            column += np.bincount(places, minlength=len(column))
+        else:
+            np.add.at(column, places, values)
+
+    def _most(self, name: str, places: Ints, times: Ints) -> None:
+        """Update the longest times of callbacks by index."""
+        np.maximum.at(self._table[NAMES.index(name)], places, times)
+
+    def callbacks(self) -> dict[str, dict[str, int]]:
+        """Return the usage of each declared callback, in file order."""
+        return {key: self._result(place) for key, place in self._places.items()}
+
+    def undeclared(self) -> dict[str, int]:
+        """Return the usage of all undeclared callbacks together."""
+        return self._result(-1)
+
+    def _result(self, place: int) -> dict[str, int]:
+        column = self._table[:, place].tolist()
+        return dict(zip(NAMES, column if column[_MEASURED] else column[:_MEASURED]))
+
+    def workers(self, count: int) -> dict[str, Any]:
+        """Return how busy the workers were; ``lent`` is the time of blocking calls."""
+        return {
+            'busy_ns': {str(w): busy for w, busy in sorted(self.by_worker.items())},
+            'lent_ns': self._lent,
+            'use': share(sum(self.by_worker.values()), count, self._duration),
+            'over_time': self.pool.result()}
+
+
+def in_one(spans: Mapping[int, tuple[Ints, Ints]]) -> tuple[Ints, Ints]:
+    """Return the starts and ends of all workers together."""
+    starts, ends = (np.concatenate([np.empty(0, dtype=np.int64), *each])
+                    for each in (zip(*spans.values()) if spans else ((), ())))
+    return starts, ends
+
+
+def _busy(spans: Mapping[int, tuple[Ints, Ints]]) -> dict[int, int]:
+    return {worker: int((ends - starts).sum()) for worker, (starts, ends) in spans.items()}
+
+
+def share(busy: int, workers: int, duration: int) -> float | None:
+    """Return the busy share of the workers' time, None if there is no time."""
+    if workers < 1 or duration <= 0:
+        return None
+    return busy / (workers * duration)

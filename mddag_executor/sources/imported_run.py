@@ -1,0 +1,402 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+An imported recording: releases, executions, completions and ends of jobs as tables.
+
+Theory of operation
+-------------------
+Nodes and callbacks are identified (``entities``) and matched with the declaration (``mapping``).
+Executions are linked with messages (``links``), and assigned to jobs (``imported_jobs``).
+
+1. *Releases.*  A timer is due at t_init + n * period.  rcl keeps this grid even if a timer is more
+   than a period late: it skips the missed times.  The release of an execution is the last due time
+   at its start.  `rcl_timer_init` is recorded shortly after the timer has read its clock, so an
+   execution that starts up to `_SLACK_NS` before a due time also has that release, at its start.
+   If t_init is unknown, or an earlier execution has the same release (the timer was reset, or
+   uses another clock), the release is the start; a warning reports it. A subscription or service
+   without publisher in the graph is released as declared: by header stamp, source timestamp, or
+   the time at which its message was taken.
+2. *Ready* is a timer's release, otherwise the source timestamp (within a process: the
+   publication). Arrival at the reader is not recorded, so transport counts as waiting.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable as Function
+from collections.abc import Mapping, Sequence
+import re
+
+from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER
+from mddag_executor.memory import give_back
+from mddag_executor.recording.columns import rows, Table
+from mddag_executor.recording.entities import Entities, INIT_EVENTS
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.mapping import Matching
+from mddag_executor.recording.tables import (
+    different,
+    earliest,
+    EXECUTIONS,
+    groups,
+    Ints,
+    Mask,
+    PUBLICATIONS,
+    Recording,
+    sort_by,
+    TAKES,
+    UNKNOWN,
+)
+from mddag_executor.sources.head import named_errors, no_run
+from mddag_executor.sources.imported_clocks import ImportedClocks
+from mddag_executor.sources.imported_events import KINDS, moved, read_events, START
+from mddag_executor.sources.imported_jobs import ImportedJobs
+from mddag_executor.sources.links import Links, Losses
+from mddag_executor.text import counted, listed
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.errors import renamed
+from mddag_executor.trace.events import Event
+from mddag_executor.trace.times import credible
+from msg_graph import Process, TaskSet
+import numpy as np
+
+_SLACK_NS = 1_000_000
+_OWN = ('mddag:job_release', 'mddag:dispatch')
+_OFF_THE_GRID = {
+    'off': ('execution', 'of timers off the grid of the period (reset, by another clock, or '
+            'without initialisation in it): released when it started'),
+    'skipped': ('period', 'of timers passed without an execution (late by more than one, '
+                'or events were lost): without a job')}
+
+
+class ImportedRun:
+    """
+    A run of another executor; ``read`` turns it into tables.
+
+    :param reader: a trace without declaration.
+    :param task_set: the declaration to judge by; None: none.
+    :param head: head of a trace of this executor; None: another executor recorded it.
+    :param progress: called regularly with the number of events read.
+    """
+
+    kinds = KINDS
+    others: Sequence[str] = (*INIT_EVENTS, *_OWN)
+    links_type = Links
+
+    def __init__(
+        self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
+        progress: Function[[int], None] | None = None,
+    ) -> None:
+        self._reader = reader
+        self.name = name
+        with named_errors(reader.path, name):
+            self._events = read_events(
+                reader, self.kinds, self.others, progress)
+        give_back()     # memory of the batches
+        starts = self._starts()
+        init = [event for event in self._events.others if event[0].name not in _OWN]
+        # this executor recorded it, but its executions are lost
+        own = any(event[0].name in _OWN for event in self._events.others)
+        if head is None and (own or not len(starts)):
+            raise no_run(reader)
+        self._link(init)
+        self._clocks = ImportedClocks(self.links)
+        if self._clocks.shift:
+            self._events = moved(self._events, self._clocks.shift)
+            self._link([event for event in self._events.others if event[0].name not in _OWN])
+            starts = self._starts()
+        threads = {self._events.threads[each] for each in np.unique(starts['thread']).tolist()}
+        # The policy of another executor is not recorded; its name replaces the pool.
+        self.head = head or Head(
+            int(starts['time'][0]), '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
+        self._imported = head is None
+        self._matching = Matching(name, self.who, task_set)
+        #: The declaration to judge by; none is recorded.
+        self.task_set = self._matching.task_set
+        self._targets = self._matching.target
+        vertices = {v.callback.key: number for number, v in enumerate(self.task_set.vertices)}
+        self._vertex = {number: vertices[target.callback.key]
+                        for number, target in self._targets.items()}
+        #: The last event's time, ns.
+        self.end = max(min(max(0, self.head.time), NEVER - 1),
+                       int(self._events.table['time'].max(initial=0)))
+        self._odd = Losses(_OFF_THE_GRID, 5)
+        self._fallbacks: Counter[str] = Counter()
+
+    def _starts(self) -> Table:
+        table = self._events.table
+        starts: Table = table[table['kind'] == START]
+        return starts
+
+    def _link(self, init: Sequence[Event]) -> None:
+        """Link executions and messages."""
+        #: The nodes and callbacks.
+        self.who = Entities()
+        self.who.read(init)
+        self.links = self.links_type(self._events, self.who)
+
+    def read(self) -> Recording:
+        """Return the recording."""
+        links, table = self.links, self._executions()
+        targets = [self._targets.get(each.number) for each in links.callbacks]
+        first, last = self._pieces()
+        jobs = ImportedJobs(self.task_set, links, targets, first, self._clocks.distrusted)
+        table['ready'], release = self._times(jobs)
+        jobs.fill(table, release, last)
+        found = Recording(
+            self.name, self.head, self.task_set, self.task_set, self.who, declared=False,
+            imported=self._imported, same=False, releases=jobs.releases, executions=table,
+            publications=self._publications(), job_ends=jobs.ends, takes=self._takes(),
+            start=earliest(table['ready'], jobs.releases['release']), end=self.end,
+            judged_until=self._judged_until(), lost=links.discarded,
+            workers_each=self.head.workers, links=True, callback_vertex=self._vertex,
+            worker_names=self._worker_names())
+        if self._imported:
+            found.process_names = dict(zip(
+                self._pids, process_names(self._pids, self._events.names)))
+            found.placed = self._placed(found.process_names)
+            found.workers_each = self._workers_each()
+        found.warnings = self._warnings(found)
+        return found
+
+    def _worker_names(self) -> list[str]:
+        """Return the names of the threads that ran callbacks, by worker."""
+        names = self._events.names
+        return [f'{names.get((pid, tid)) or "process"} {pid}, thread {tid}'
+                for pid, tid in self._workers] if self._imported else []
+
+    def _executions(self) -> Table:
+        """Return the executions, without jobs."""
+        runs, events = self.links.runs, self._events
+        ended = np.flatnonzero(runs['end_at'] >= 0)
+        ended = ended[sort_by(runs['end_at'][ended])]
+        threads, first = np.unique(runs['thread'][ended], return_index=True)
+        threads = threads[sort_by(first)]
+        worker = np.full(len(events.threads), UNKNOWN)
+        worker[threads] = np.arange(len(threads))
+        self._workers = [events.threads[each] for each in threads.tolist()]
+        table = rows(
+            EXECUTIONS, len(runs), callback=_values(
+                [each.number for each in self.links.callbacks], runs['callback']),
+            thread=_values([tid for _, tid in events.threads], runs['thread']),
+            start=runs['start'], began=runs['start'], end=runs['end'], message=runs['message'],
+            busy=np.where(runs['end'] >= 0, runs['end'] - runs['start'], UNKNOWN),
+            cpu=UNKNOWN, order=UNKNOWN, worker=UNKNOWN, process=self._process_of(runs))
+        table['worker'][ended] = worker[runs['thread'][ended]]
+        return table
+
+    def _process_of(self, runs: Table) -> Ints:
+        """
+        Return the process of each execution, those with declared callbacks first.
+
+        Threads of this executor are workers of one pool.
+        """
+        pids = np.array([pid for pid, _ in self._events.threads], dtype=np.int64)[runs['thread']]
+        declared = [each.number in self._vertex for each in self.links.callbacks]
+        known = np.array(declared, dtype=np.bool_)[runs['callback']]
+        self._pids = list(dict.fromkeys([*np.unique(pids[known]).tolist(),
+                                         *np.unique(pids).tolist()]))
+        self._n_declared = len(np.unique(pids[known]))
+        if not self._imported:
+            return np.zeros(len(runs), dtype=np.int64)
+        order = np.argsort(self._pids)
+        found: Ints = order[np.searchsorted(np.array(self._pids)[order], pids)] if len(
+            runs) else pids
+        return found
+
+    def _placed(self, names: Mapping[int, str]) -> list[Process]:
+        """Return the nodes of each process in which declared callbacks ran, if it has several."""
+        pids = self._pids[:self._n_declared]
+        if len(pids) < 2:
+            return []
+        nodes = dict.fromkeys(callback.node for callback in self.task_set.callbacks)
+        # a node that did not run belongs to the first process, as in declarations
+        pid_of = dict.fromkeys(nodes, pids[0])
+        for each in reversed(self.links.callbacks):
+            if each.node is not None and each.node.name in nodes and each.node.pid in pids:
+                pid_of[each.node.name] = each.node.pid
+        return [Process(names[pid], tuple(node for node in nodes if pid_of[node] == pid))
+                for pid in pids]
+
+    def _workers_each(self) -> int:
+        """Return the largest number of threads of a process in which declared callbacks ran."""
+        pids = self._pids[:self._n_declared]
+        threads = Counter(pid for pid, _ in self._workers)
+        return max((threads[pid] for pid in pids), default=0) or self.head.workers
+
+    def _publications(self) -> Table:
+        messages, publishers = self.links.messages, self.links.publishers
+        run = messages['run']
+        callback = np.append(self.links.runs['callback'], UNKNOWN)[run]
+        width = len(publishers) + 1     # -1: unknown
+        pairs, which = different(callback * width + messages['publisher'] + 1)
+        vertices = [self._publisher_vertex(pair // width, pair % width - 1)
+                    for pair in pairs.tolist()]
+        return rows(
+            PUBLICATIONS, len(messages), publisher=_values(
+                [each.number for each in publishers], messages['publisher']),
+            execution=run, time=messages['time'], source_timestamp=messages['stamp'],
+            vertex=np.array(vertices, dtype=np.int64)[which])
+
+    def _publisher_vertex(self, callback: int, publisher: int) -> int:
+        """Return a vertex of a declared callback that publishes with its node's publisher."""
+        if callback < 0 or publisher < 0:
+            return UNKNOWN
+        number, node = self.links.callbacks[callback].number, self.links.publishers[publisher].node
+        target = self._targets.get(number)
+        known = target is not None and node is not None and target.callback.node == node.name
+        return self._vertex[number] if known else UNKNOWN
+
+    def _takes(self) -> Table:
+        run, message = self.links.takes
+        return rows(TAKES, len(run), execution=run, message=message,
+                    time=self.links.runs['start'][run])
+
+    def _judged_until(self) -> int:
+        """Return the time at which open jobs are judged."""
+        return self.end
+
+    def _pieces(self) -> tuple[Ints, Mask]:
+        """
+        Return by run of a callback the first run of its execution, and whether it ends with it.
+
+        Here each run is an execution.
+        """
+        return np.arange(len(self.links.runs)), self.links.runs['end_at'] >= 0
+
+    # --- times -----------------------------------------------------------------------------------
+
+    def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
+        """Return by execution when it was ready, and by source execution its release."""
+        runs, messages, start = self.links.runs, self.links.messages, self.links.runs['start']
+        sent = self._stamps('stamp')
+        if len(messages):
+            message = messages[runs['message']]
+            published = np.where(
+                message['stamp'] != 0, message['stamp'] + self._of_sender, message['time'])
+            sent = np.where((sent == 0) & (runs['message'] >= 0), published, sent)
+        ready = np.minimum(np.where(sent != 0, sent, _arrival(runs)), start)
+        timers = np.flatnonzero(self._is_any('timer')[runs['callback']])
+        ready[timers] = self._due(timers, start[timers])
+        return ready, self._releases(jobs, ready, 'timer')
+
+    @property
+    def _of_sender(self) -> Ints:
+        """Return by execution how the clock of the sender of its message was moved, ns."""
+        at = self.links.messages['at']
+        shift = self._clocks.shifts[self._events.table['thread'][at]]
+        found: Ints = np.append(shift, 0)[self.links.runs['message']]
+        return found
+
+    def _stamps(self, name: str) -> Ints:
+        """Return the stamps of messages by execution, on the recording's clock; 0: unknown."""
+        runs = self.links.runs
+        known = credible(runs[name], runs['start'])
+        found: Ints = np.where(known, runs[name] + self._of_sender, 0)
+        return found
+
+    def _is_any(self, *kinds: str) -> Mask:
+        """Return by callback whether it is of one of the kinds."""
+        return np.array([each.kind in kinds for each in self.links.callbacks], dtype=np.bool_)
+
+    def _releases(self, jobs: ImportedJobs, ready: Ints, *by_ready: str) -> Ints:
+        """
+        Return the releases of source executions, which are not ready before.
+
+        :param by_ready: kinds of callbacks that are released when they are ready.
+        """
+        stamps, stated_stamps = (
+            self._stamps(name)[jobs.sources] for name in ('stamp', 'stated'))
+        runs = self.links.runs[jobs.sources]
+        start, number = runs['start'], runs['callback']
+        wanted = np.array([dag.release_from for dag in self.task_set.dags])[jobs.releases['dag']]
+        by_header, by_stamp = wanted == 'header_stamp', wanted != 'arrival'
+        known, stated = stamps != 0, stated_stamps != 0
+        stamp = np.where(by_stamp & known, stamps, _arrival(runs))
+        stamp = np.minimum(np.where(by_header & stated, stated_stamps, stamp), start)
+        other = self._is_any(*by_ready)[number]
+        release: Ints = np.where(other, ready[jobs.sources], stamp)
+        ready[jobs.sources] = np.maximum(ready[jobs.sources], release)
+        missing = np.flatnonzero(~other & np.where(by_header, ~stated, by_stamp & ~known))
+        for each, first, n in zip(*np.unique(
+                number[missing], return_index=True, return_counts=True)):
+            name = self._targets[self.links.callbacks[each].number].callback.key
+            self._fallbacks[f'{name} ({wanted[missing[first]]})'] += int(n)
+        return release
+
+    def _due(self, which: Ints, time: Ints) -> Ints:
+        """Return the last due times of timers' executions (rule 1); off the grid: the given."""
+        due, number = time.copy(), self.links.runs['callback'][which]
+        order = sort_by(number)
+        for begin, until in zip(*groups(number[order])):
+            mine = order[begin:until]
+            timer = self.links.callbacks[number[mine[0]]]
+            grid, period = timer.grid, timer.period
+            if grid is None or abs(grid) >= NEVER or period <= 0:
+                self._odd.count('off', timer.label, len(mine))
+                continue
+            n = (time[mine] - grid + min(_SLACK_NS, period // 10)) // period
+            newer = n > np.maximum.accumulate(np.append(0, n))[:-1]
+            mine, n = mine[newer], n[newer]
+            due[mine] = np.minimum(grid + n * period, time[mine])
+            self._odd.count('off', timer.label, int((~newer).sum()))
+            self._odd.count('skipped', timer.label, int((np.diff(n) - 1).sum()))
+        return due
+
+    # --- warnings --------------------------------------------------------------------------------
+
+    def _warnings(self, found: Recording) -> list[str]:
+        """Return missing or doubtful data, one line each."""
+        name, path = self.name, self._reader.path
+        lines = [renamed(text, path, name) for text in self._reader.warnings]
+        if self.who.incomplete:
+            lines.append(
+                f'{name}: left out: {counted(self.who.incomplete, "event")} of the '
+                'initialisation without some of the fields')
+        lines += self._matching.warnings
+        if self._events.warning:
+            lines.append(f'{name}: {self._events.warning}')
+        if found.lost:
+            lines.append(
+                f'{name}: the tracer discarded {counted(found.lost, "event")} or more: '
+                'executions and messages may be missing')
+        lines += [f'{name}: {text}' for text in self._clocks.lines()]
+        lines += [f'{name}: {text}' for text in self.links.losses.lines()]
+        unjudged = found.unjudged
+        if unjudged:
+            dags = [f'{found.task_set.dags[dag].name} ({n})' for dag, n in unjudged.items()]
+            lines.append(
+                f'{name}: not judged, because their events may be missing: '
+                f'{counted(sum(unjudged.values()), "job")}: {listed(dags)}')
+        lines += [f'{name}: {text}' for text in self._odd.lines()]
+        if self._fallbacks:
+            lines.append(
+                f'{name}: {counted(self._fallbacks.total(), "release")} by the next best stamp, '
+                'because the declared one is not recorded or years away: '
+                f'{listed(list(self._fallbacks))}')
+        if found.task_set.dags and not len(found.releases):
+            lines.append(f'{name}: no job was released in it')
+        return lines
+
+
+def process_names(pids: Sequence[int], names: Mapping[tuple[int, int], str]) -> list[str]:
+    """
+    Return a name for each process that a declaration may have, all different.
+
+    :param names: by process and thread its recorded name; that of the process is its first one's.
+    """
+    plain = [re.sub('[^A-Za-z0-9_.-]', '_', names.get((pid, pid), '')) or 'process'
+             for pid in pids]
+    return [name if plain.count(name) == 1 and name != 'process' else f'{name}_{pid}'
+            for name, pid in zip(plain, pids)]
+
+
+def _arrival(runs: Table) -> Ints:
+    """Return when messages were taken; if unknown, when their executions started."""
+    taken: Ints = np.where(runs['taken'] != 0, runs['taken'], runs['start'])
+    return taken
+
+
+def _values(by_number: list[int], numbers: Ints) -> Ints:
+    """Return the values of numbers; ``UNKNOWN`` for -1."""
+    found: Ints = np.array([*by_number, UNKNOWN], dtype=np.int64)[numbers]
+    return found

@@ -1,0 +1,517 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Joins the traces of several processes into the recording of one run.
+
+Theory of operation
+-------------------
+Each trace becomes a recording; their tables are merged in the order of time.
+
+1. *Clocks.*  A trace's times are the machine's steady clock plus a recorded offset
+   (``caret_init``).  So all traces of one machine are converted exactly to the first trace's
+   clock. For other machines the offset is given or estimated from messages (``clocks``), otherwise
+   0.
+2. *Numbers.*  Addresses are unique within a process; the number of the trace is added above their
+   48 bits.  Workers are numbered consecutively.  A process or thread id that another trace
+   also uses (containers, other machines) is replaced by an unused one.
+3. *Jobs* are renumbered in the order of their first release.  Releases of two processes belong to
+   the same job if they are equal within ``SAME_RELEASE``: releases of a burst are closer, so the
+   nearest one counts, of equally near ones the oldest.  If header stamps join the jobs of a DAG,
+   a release also belongs to the job that was released up to one period of the DAG earlier:
+   the stamp is later than the timer was due.  Any other release is a new job.  A stamp is a time
+   of the source machine's clock, no matter which machine recorded it.
+4. If several processes run a DAG, the vertices of all of them are expected.  Jobs are judged as
+   soon as all processes that existed at the beginning judge.
+5. A process without recorded end was killed.  Its open jobs are reported, and the run continues.
+6. *One run.*  Traces belong to one run if their time ranges, from first to last event, overlap
+   directly or through other traces, and no vertex runs in two processes at a time.  Otherwise they
+   are refused.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import os
+from typing import Any
+
+from mddag_executor.core import NEVER
+from mddag_executor.errors import UsageError
+from mddag_executor.recording.columns import concatenate, Table
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import Head, is_declared, ReplayError
+from mddag_executor.recording.tables import (
+    ALL_LEGS,
+    different,
+    earliest,
+    groups,
+    Ints,
+    Jobs,
+    Mask,
+    NOTHING,
+    Recording,
+    RowNumbers,
+    sort_by,
+    TABLES,
+    UNKNOWN,
+)
+from mddag_executor.sources import clocks
+from mddag_executor.sources.executions import Numbering
+from mddag_executor.sources.head import declared, read_head
+from mddag_executor.sources.own import end_lines, read_process
+from mddag_executor.text import counted, listed
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.numbers import Numbers
+from mddag_executor.trace.schema import EVENTS
+from msg_graph import Dag, Process
+import numpy as np
+
+SAME_RELEASE = 100_000
+_KEPT = 1024
+_BITS = 48
+_INIT, _SHUTDOWN, _JUDGE_FROM = 'ros2_caret:caret_init', 'mddag:shutdown', 'mddag:judge_from'
+_NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
+_TIMES = {
+    'releases': ('release', 'noticed'), 'executions': ('ready', 'began', 'start', 'end'),
+    'publications': ('time', 'source_timestamp'), 'job_ends': ('time',),
+    'drops': ('time',), 'losses': ('time',), 'demotions': ('time',),
+    'misses': ('deadline', 'completed'), 'stops': ('start', 'end')}
+_HAPPENED = {
+    'releases': 'noticed', 'executions': 'end', 'publications': 'time', 'job_ends': 'time',
+    'drops': 'time', 'demotions': 'time', 'stops': 'end'}
+
+Event = tuple[Any, ...]
+Progress = Callable[[int], None]
+
+
+def label_of(path: str) -> str:
+    """Return the name of a trace's process: `up` of `run.up.mcap`, `up.2` of `run.up.2.mcap`."""
+    rest, _, word = os.path.basename(path).removesuffix('.mcap').rpartition('.')
+    return f'{rest.rpartition(".")[2]}.{word}' if rest and word.isdecimal() else word
+
+
+class _Part:
+    """
+    One trace: the position of its times, workers and addresses in the joined recording.
+
+    :ivar ran: by vertex the time of its first and last execution.
+    :ivar hosted: by DAG the vertices that run here; only if some run elsewhere.
+    :ivar number: by release the number of its job; ``is_first``: whether no other process released
+        it before; ``expected``: the number of legs to complete here.
+    :ivar open_jobs: DAGs and numbers of the jobs that are open at the end.
+    """
+
+    ran: dict[int, tuple[int, int]]
+    number: Ints
+    is_first: Mask
+    expected: Ints
+    open_jobs: list[tuple[int, int]]
+    recording: Recording
+    seen_at: Ints
+
+    def __init__(self, place: int, path: str, first_worker: int) -> None:
+        self.place, self.name, self.first_worker = place, path, first_worker
+        self.reader = TraceReader(path)
+        head = read_head(self.reader)
+        if head is None:
+            raise ReplayError(path, 'it was not recorded by this executor', 'replay it by itself')
+        if not is_declared(head):
+            raise ReplayError(
+                path, 'it was recorded without a declaration, so its jobs have no names that '
+                'other traces know', 'replay it by itself, with a GRAPH')
+        self.head: Head = head
+        last = {event[0]: event[4:] for event in self.reader.events(
+            {_INIT, clocks.HOST, _SHUTDOWN, _JUDGE_FROM}) if None not in event}
+        self.clock: int = last.get(_INIT, (0,))[0]
+        self.boot: str = last.get(clocks.HOST, ('', ''))[1]
+        self.end: int | None = last.get(_SHUTDOWN, (None,))[0]
+        self.judges_from: int = last.get(_JUDGE_FROM, (0,))[0]
+        self.shift = self.last = 0
+        self.label = label_of(path)
+        self.hosted: dict[int, frozenset[int]] = {}
+
+    @property
+    def first(self) -> int:
+        """Return the time of its first event, by the joined clock."""
+        return self.head.time + self.shift
+
+    def read(
+        self, who: Entities, threads: Numbers, workers: int, count: int, progress: Progress | None
+    ) -> None:
+        """Read its tables, with joined times, addresses and ``workers`` (rules 1 and 2)."""
+        found, self.seen_at = read_process(
+            self.reader, self.name, self.head, who, self._edited,
+            None if progress is None else lambda more: progress(count + more))
+        self.recording = found
+        if self.shift:
+            self.seen_at = self.seen_at + self.shift
+            for name, columns in _TIMES.items():
+                for column in columns:
+                    times = getattr(found, name)[column]
+                    times[times > 0] += self.shift
+            if found.notices_stops is not None:
+                found.notices_stops += self.shift
+        for addresses in (
+                found.executions['callback'], found.losses['callback'],
+                found.publications['publisher']):
+            addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
+        worker = found.executions['worker']
+        # other threads, with higher numbers, lent themselves
+        worker += np.where(worker < 0, 0, self.first_worker + np.where(
+            worker < self.head.workers, 0, workers)).astype(worker.dtype)
+        thread = found.executions['thread']
+        numbers, of = different(thread)
+        thread[:] = np.array([threads.of(self.place, each) for each in numbers.tolist()],
+                             dtype=np.int64)[of]
+        self.last = max(self.first, int(self.seen_at.max(initial=0)), *(
+            int(getattr(found, name)[column].max(initial=0))
+            for name, column in _HAPPENED.items()))
+
+    def _edited(self, event: Event) -> Event:
+        """Return an event of the initialisation with joined addresses."""
+        kinds = EVENTS[event[0]].fields
+        return (*event[:4], *(
+            value | self.place << _BITS if kind == 'uint64' and field not in _NO_ADDRESSES
+            and 0 < value < 1 << _BITS else value
+            for value, (field, kind) in zip(event[4:], kinds)))
+
+    def renumber(self, legs: Ints, dag_of: Ints) -> RowNumbers:
+        """
+        Renumber the jobs in all tables; drop rows of unknown jobs.
+
+        :param legs: by vertex the number of its legs; ``dag_of``: its DAG, at the end -1.
+        :return: the new numbers of executions.
+        """
+        found = self.recording
+        jobs = Jobs(len(found.task_set.dags), found.releases)
+        rows = np.append(jobs.rows, UNKNOWN)
+        table = found.executions
+        row = rows[jobs.places(table)]
+        kept = (row >= 0) | (table['vertex'] < 0)
+        done = np.flatnonzero((table['completes'] != NOTHING) & (row >= 0))
+        is_open = self.expected > np.bincount(row[done], np.where(
+            table['leg'][done] == ALL_LEGS, legs[table['vertex'][done]], 1),
+            minlength=len(self.number))
+        ended = rows[jobs.places(found.job_ends)]
+        is_open[ended[ended >= 0]] = False
+        self.open_jobs = list(zip(
+            found.releases['dag'][is_open].tolist(), self.number[is_open].tolist()))
+        self._note_ran(table[(row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)])
+        known = row >= 0
+        table['job'][known] = self.number[row[known]]
+        for name in ('job_ends', 'misses', 'demotions'):
+            table = getattr(found, name)
+            row = rows[jobs.places(table)]
+            table['job'] = self.number[row] if len(self.number) else UNKNOWN
+            setattr(found, name, table[row >= 0])
+        drops = found.drops     # those of unknown jobs are still counted
+        row = rows[jobs.places_of(dag_of[drops['vertex']], drops['job'])]
+        drops['job'] = np.append(self.number, UNKNOWN)[row]
+        new = RowNumbers(kept)
+        found.executions = found.executions[kept]
+        found.releases['job'] = self.number
+        found.releases = found.releases[self.is_first]
+        return new
+
+    def _note_ran(self, started: Table) -> None:
+        """Note the first and last execution of vertices."""
+        started = started[sort_by(started['vertex'], started['start'])]
+        ran = [(int(started['start'][begin]), int(started['vertex'][begin]),
+                int(started['start'][until - 1]))
+               for begin, until in zip(*groups(started['vertex']))]
+        self.ran = {vertex: (first, last) for first, vertex, last in sorted(ran)}
+
+
+class Joined:
+    """
+    Joins traces of this executor.
+
+    :param offsets: how far clocks of other machines are ahead of the first trace's clock, ns, by
+        the last word of a trace's name, or its path.
+    :raises mddag_executor.trace.TraceError: if a file is not a trace.
+    :raises ReplayError: if the traces are of several runs.
+    """
+
+    def __init__(self, paths: Sequence[str], offsets: Mapping[str, int]) -> None:
+        self._parts: list[_Part] = []
+        self._workers = 0
+        for place, path in enumerate(paths):
+            self._parts.append(_Part(place, path, self._workers))
+            self._workers += self._parts[-1].head.workers
+        first = self._parts[0]
+        self.head, self.name = first.head, ', '.join(paths)
+        self.task_set = declared(first.head, first.name)
+        self.warnings: list[str] = []
+        for part in self._parts:
+            if part.head.yaml != self.head.yaml:
+                raise ReplayError(
+                    part.name, f'it was recorded with another declaration than {first.name}',
+                    'give the traces of one run')
+        self._machines = clocks.machines([(part.boot, part.clock) for part in self._parts])
+        self._set_clocks(self._given(offsets))
+        # by DAG: releases with their job numbers, and the parts that have released the job
+        self._releases: list[deque[tuple[int, int, set[int]]]] = [
+            deque(maxlen=_KEPT) for _ in self.task_set.dags]
+        self._next = [0] * len(self.task_set.dags)
+        #: By vertex the number of its legs and its DAG, and by DAG its vertices.
+        self._legs = Numbering(self.task_set).n_legs
+        self._dag_of = np.array([
+            *(dag.index for dag in self.task_set.dags for _ in dag.vertices), UNKNOWN])
+        first_of = np.cumsum([0, *(len(dag.vertices) for dag in self.task_set.dags)]).tolist()
+        self._vertices = [range(*each) for each in zip(first_of, first_of[1:])]
+        self._hosted: list[tuple[int, int, int, frozenset[int]]] = []
+
+    def _given(self, offsets: Mapping[str, int]) -> dict[int, int]:
+        """Return the given offsets, by machine."""
+        found: dict[int, int] = {}
+        for label, ahead in offsets.items():
+            machine = next(
+                (m for m, part in zip(self._machines, self._parts)
+                 if label in (part.name, part.label)), None)
+            if machine is None:
+                raise UsageError(f'--offset: there is no trace of {label}: name one of '
+                                 + listed([part.label for part in self._parts]))
+            if machine == 0:
+                raise UsageError(f"--offset: {label} is on the first trace's machine, whose clock "
+                                 'the others are compared with: name a process of another one')
+            if machine in found:
+                raise UsageError(f'--offset: {label} is on a machine whose offset is given '
+                                 'already: give one for each machine')
+            found[machine] = ahead
+        return found
+
+    def _set_clocks(self, given: Mapping[int, int]) -> None:
+        """Convert all traces to the first trace's clock (rule 1)."""
+        several = set(self._machines) - {0}
+        for part, machine in zip(self._parts, self._machines):
+            part.shift = self._parts[machine].clock - part.clock
+        ways: clocks.Ways = {}
+        if several - given.keys():
+            ways = clocks.ways(
+                [clocks.Messages(part.reader) for part in self._parts], self._machines,
+                [part.shift for part in self._parts])
+        known = clocks.offsets(several, ways, given)
+        for machine in sorted(several):
+            parts = [p for p, m in zip(self._parts, self._machines) if m == machine]
+            for part in parts:
+                part.shift -= known[machine].ahead if machine in known else 0
+            if machine not in given:
+                self.warnings.append(
+                    f'{", ".join(part.name for part in parts)}: recorded on another machine than '
+                    f'{self._parts[0].name}: '
+                    + clocks.said(known.get(machine), ways.get((0, machine)), parts[0].label))
+
+    def recording(self, progress: Callable[[int], None] | None = None) -> Recording:
+        """
+        Return the recording of the whole run.
+
+        :param progress: called regularly with the number of events read.
+        :raises mddag_executor.trace.TraceError: if a trace cannot be read.
+        :raises ReplayError: if the traces are of several runs.
+        """
+        who, threads, count = Entities(by_address=True), Numbers(), 0
+        for part in self._parts:
+            part.read(who, threads, self._workers, count, progress)
+            count += part.reader.message_count or 0
+        self._number_jobs()
+        rows = [part.renumber(self._legs, self._dag_of) for part in self._parts]
+        self._check_run()
+        head = self.head._replace(
+            time=min(part.first for part in self._parts), workers=self._workers)
+        found = Recording(
+            self.name, head, self.task_set, self.task_set, who, same=False,
+            processes=len(self._parts), placed=self._placed(),
+            workers_each=max(part.head.workers for part in self._parts),
+            # the last word of the trace's name
+            worker_names=[f'{part.label} {worker}' for part in self._parts
+                          for worker in range(part.head.workers)])
+        self._join(found, rows)
+        self._set_end(found)
+        found.warnings = [*self.warnings, *self._lines(found.end), *end_lines(found)]
+        return found
+
+    def _join(self, found: Recording, rows: Sequence[RowNumbers]) -> None:
+        """Merge the tables of all traces; ``rows``: the new numbers of executions."""
+        parts = self._parts
+        ranks = self._ranks()
+        before = 0
+        reasons: dict[str, int] = {}
+        for part, rank in zip(parts, ranks):
+            of = part.recording
+            by = rows[part.place].new(of.publications['execution'])
+            of.publications['execution'] = np.where(by >= 0, by + before, UNKNOWN)
+            before += len(of.executions)
+            for table in (of.releases, of.executions, of.job_ends):
+                known = table['order'] >= 0
+                table['order'][known] = rank[table['order'][known]]
+            numbers = np.array([
+                reasons.setdefault(reason, len(reasons)) for reason in of.drop_reasons] or [0])
+            of.drops['reason'] = numbers[of.drops['reason']]
+            for name in TABLES:
+                table = getattr(of, name)
+                if 'process' in table.names:
+                    table['process'] = part.place
+        for name in TABLES:
+            setattr(found, name, concatenate([getattr(p.recording, name) for p in parts]))
+        found.releases = found.releases[sort_by(found.releases['order'])]
+        found.publications = found.publications[sort_by(found.publications['time'])]
+        found.drop_reasons = tuple(reasons)
+        found.hosted = [
+            (int(ranks[place][order]), dag, vertices)
+            for place, order, dag, vertices in self._hosted]
+
+    def _ranks(self) -> list[Ints]:
+        """Return by part the joined positions of its positions in the order; 0 is before all."""
+        times = np.concatenate([part.seen_at for part in self._parts])
+        rank = np.empty(len(times), dtype=np.int64)
+        rank[np.argsort(times, kind='stable')] = np.arange(1, len(times) + 1)
+        return np.split(rank, np.cumsum([len(part.seen_at) for part in self._parts])[:-1])
+
+    def _set_end(self, found: Recording) -> None:
+        """Find when judging begins and ends (rules 4 and 5)."""
+        labels = {part.label for part in self._parts}
+        # without restarted processes, and those that have never judged
+        judging = [part.judges_from + part.shift for part in self._parts
+                   if 0 < part.judges_from < NEVER
+                   and part.label.partition('.')[0] not in labels - {part.label}]
+        if judging:
+            found.judge_from = max(judging)
+        ends = [part.end + part.shift for part in self._parts if part.end is not None]
+        end = max(int(part.seen_at.max(initial=0)) for part in self._parts)
+        found.end = found.judged_until = min(end, NEVER - 1)
+        if ends:
+            found.end = max(max(part.last for part in self._parts), *ends)
+            found.judged_until, found.shut_down = max(ends), True
+        found.lost = sum(part.recording.lost for part in self._parts)
+        found.notices_stops = min(
+            (part.recording.notices_stops for part in self._parts
+             if part.recording.notices_stops is not None), default=None)
+        table = found.executions
+        # a process may end before the others
+        waited = (table['end'] < 0) & (table['worker'] < 0)
+        table['start'][waited] = table['began'][waited] = found.end
+        found.start = earliest(found.releases['release'], table['ready'][
+            (table['end'] >= 0) & (table['start'] >= 0)])
+
+    # --- jobs ------------------------------------------------------------------------------------
+
+    def _number_jobs(self) -> None:
+        """Assign numbers to jobs (rule 3), and note the expected vertices (rule 4)."""
+        events: list[tuple[int, int, int, int, Any]] = []
+        for part in self._parts:
+            of, seen_at = part.recording, part.seen_at
+            events += [
+                (int(seen_at[order]), part.place, order, row, None)
+                for row, order in enumerate(of.releases['order'].tolist())]
+            events += [(int(seen_at[order]), part.place, order, dag, vertices)
+                       for order, dag, vertices in of.hosted]
+        columns = [
+            [part.recording.releases[name].tolist() for name in ('dag', 'release', 'noticed')]
+            for part in self._parts]
+        for part in self._parts:
+            part.number = np.full(len(part.recording.releases), UNKNOWN)
+            part.is_first = np.zeros(len(part.number), dtype=np.bool_)
+            part.expected = np.zeros(len(part.number), dtype=np.int64)
+        events.sort(key=lambda event: event[:3])
+        legs_here: list[dict[int, int]] = [{} for _ in self._parts]
+        for _, place, order, which, vertices in events:
+            part = self._parts[place]
+            if vertices is not None:
+                part.hosted[which] = vertices
+                legs_here[place].pop(which, None)
+                every = frozenset().union(
+                    *(each.hosted.get(which, ()) for each in self._parts))
+                self._hosted.append((place, order, which, every))
+                continue
+            dag, release, noticed = (column[which] for column in columns[place])
+            if release < noticed:   # otherwise the release is a stamp in the future
+                release = self._by_source(self.task_set.dags[dag], release, part)
+            known = self._find(self.task_set.dags[dag], release, place)
+            if known is None:
+                number = self._next[dag]
+                self._next[dag] += 1
+                self._releases[dag].append((release, number, {place}))
+                part.recording.releases['release'][which] = release
+                part.is_first[which] = True
+            else:
+                number = known[1]
+                known[2].add(place)
+            part.number[which] = number
+            if dag not in legs_here[place]:
+                legs_here[place][dag] = int(sum(
+                    self._legs[v] for v in part.hosted.get(dag, self._vertices[dag])))
+            part.expected[which] = legs_here[place][dag]
+
+    def _by_source(self, dag: Dag, release: int, part: _Part) -> int:
+        """Return a release on the joined clock; a stamp counts by the source machine's clock."""
+        if dag.release_from != 'header_stamp' or self._vertices[
+                dag.index][dag.source] in part.hosted.get(dag.index, self._vertices[dag.index]):
+            return release
+        machine, found = next(
+            ((m, p) for m, p in zip(self._machines, self._parts)
+             if self._vertices[dag.index][dag.source] in p.hosted.get(dag.index, ())), (0, part))
+        if machine == self._machines[part.place]:
+            return release
+        return release - part.shift + found.shift
+
+    def _find(self, dag: Dag, release: int, place: int) -> tuple[int, int, set[int]] | None:
+        """Return the job of a release that another process has released (rule 3)."""
+        stamped = dag.release_from == 'header_stamp'
+        nearest = earlier = None
+        least = SAME_RELEASE
+        for known in reversed(self._releases[dag.index]):
+            away = release - known[0]
+            if away > max(dag.period_ns, SAME_RELEASE):
+                break
+            if place in known[2]:
+                continue
+            if abs(away) <= least:
+                nearest, least = known, abs(away)
+            elif stamped and earlier is None and 0 < away < dag.period_ns:
+                earlier = known
+        return earlier if nearest is None else nearest
+
+    def _check_run(self) -> None:
+        """Refuse traces of several runs (rule 6)."""
+        runs: list[list[_Part]] = []
+        for part in sorted(self._parts, key=lambda part: part.first):
+            if not runs or part.first > max(each.last for each in runs[-1]):
+                runs.append([])
+            for other in runs[-1]:
+                for vertex, (first, last) in part.ran.items():
+                    began, ended = other.ran.get(vertex, (0, -1))
+                    if max(first, began) <= min(last, ended):
+                        key = self.task_set.vertices[vertex].callback.key
+                        raise ReplayError(
+                            part.name, f'{key} ran in it and, at the same time, in {other.name}: '
+                            'these are of two runs', 'give the traces of one')
+            runs[-1].append(part)
+        if len(runs) > 1:
+            several = len(set(self._machines)) > 1
+            raise ReplayError(
+                runs[1][0].name, f'it is of another run than {runs[0][0].name}: no trace goes on '
+                'from one to the other', 'give the traces of one run: ' + ', or '.join(
+                    ' '.join(part.name for part in run) for run in runs)
+                + several * ' (or --offset, if clocks of machines differed)')
+
+    def _placed(self) -> list[Process]:
+        """Return the nodes of each process."""
+        if self.task_set.processes:
+            return list(self.task_set.processes)
+        return [
+            Process(part.label, tuple(dict.fromkeys(
+                self.task_set.vertices[vertex].callback.node for vertex in part.ran)))
+            for part in self._parts]
+
+    def _lines(self, end: int) -> Iterator[str]:
+        """Yield missing data of each trace, and jobs that ended with its process (rule 5)."""
+        for part in self._parts:
+            yield from part.recording.warnings
+            if part.end is not None:
+                continue
+            jobs = [f'{self.task_set.dags[dag].name} {number}' for dag, number in part.open_jobs]
+            yield (
+                f'{part.name}: its end is not recorded (the process was killed, or the trace is '
+                f'cut): it ends {max(0, end - part.last) / 1e9:.3f} s before the run; '
+                + (f'{counted(len(jobs), "job")} ended with it: {listed(jobs)}' if jobs
+                   else 'no job was open in it'))

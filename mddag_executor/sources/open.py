@@ -1,0 +1,122 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Opens recordings of every kind; the only place that distinguishes the kinds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+import os
+
+from mddag_executor.recording.head import is_declared, ReplayError
+from mddag_executor.recording.mapping import judged_by
+from mddag_executor.recording.tables import Recording
+from mddag_executor.sources.head import named_errors, read_head
+from mddag_executor.sources.own import read_own
+from mddag_executor.trace import TraceReader
+from msg_graph import load, TaskSet
+
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Traces:
+    """
+    The traces of the processes of one run.
+
+    :ivar paths: paths of the traces.
+    :ivar offsets: how far the clocks of other machines are ahead of the first trace's clock, ns,
+        by the last word of the trace's name (``control`` of ``run.control.mcap``).  Missing
+        offsets are estimated from messages.
+    """
+
+    paths: Sequence[str]
+    offsets: Mapping[str, int] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return ', '.join(self.paths)
+
+
+Given = str | os.PathLike[str] | Sequence[str] | Traces | TraceReader
+"""A trace or its path, or the paths of the traces of all processes of one run."""
+
+
+def open_recording(
+    path: Given, task_set: TaskSet | str | os.PathLike[str] | None = None,
+    name: str | None = None, progress: Progress | None = None,
+) -> Recording:
+    """
+    Read a trace of this executor, an imported trace, the traces of one run, or an ordinary bag.
+
+    A bag only has releases: the messages that start the declared DAGs.
+
+    :param task_set: the declaration to judge by, or its path; None: the one in the trace, if any.
+    :param name: the recording's name in messages, if not its path.
+    :param progress: called regularly with the number of events read.
+    :raises mddag_executor.trace.TraceError: if a file is not a trace.
+    :raises mddag_executor.ReplayError: if the recording has nothing to replay or none of
+        the declaration's callbacks, or if it is a bag, and there is no declaration.
+    """
+    if isinstance(task_set, (str, os.PathLike)):
+        task_set = load(task_set)
+    if not isinstance(path, (str, os.PathLike, TraceReader)):
+        traces = path if isinstance(path, Traces) else Traces(path)
+        from mddag_executor.sources.joining import Joined
+        return judged_by(Joined(traces.paths, traces.offsets).recording(progress), task_set)
+    path, reader = _opened(path)
+    name = name or path
+    if reader is None:
+        from mddag_executor.sources.bags import is_ordinary
+        if is_ordinary(path):
+            return _bag(path, task_set, name)
+    with named_errors(path, name):
+        reader = reader or TraceReader(path)
+        head = read_head(reader)
+        if head is None:
+            from mddag_executor.sources.imported_run import ImportedRun
+            return ImportedRun(reader, name, task_set, progress=progress).read()
+        if task_set is None or is_declared(head):
+            return judged_by(read_own(reader, name, head, progress), task_set)
+        from mddag_executor.sources.undeclared_run import UndeclaredRun
+        return UndeclaredRun(reader, name, task_set, head, progress).read()
+
+
+def _opened(path: str | os.PathLike[str] | TraceReader) -> tuple[str, TraceReader | None]:
+    """Return the path of a trace, and the trace if it is open."""
+    return (path.path, path) if isinstance(path, TraceReader) else (os.fspath(path), None)
+
+
+def _bag(path: str, task_set: TaskSet | None, name: str) -> Recording:
+    """Return the recording of an ordinary bag."""
+    if task_set is None:
+        raise ReplayError(
+            name, 'it is an ordinary bag: nothing in it says which callbacks its messages start',
+            'give the GRAPH')
+    from mddag_executor.sources.bag_run import read_bag
+    return read_bag(path, task_set, name)
+
+
+def check_declared(path: Given, name: str) -> None:
+    """Check that a recording declares deadlines, or raise ReplayError."""
+    if isinstance(path, (str, os.PathLike, TraceReader)):
+        path, reader = _opened(path)
+        with named_errors(path, name):
+            reader = reader or TraceReader(path)
+            if read_head(reader) is None:
+                from mddag_executor.sources.imported_run import ImportedRun
+                ImportedRun(reader, name, None)     # None: the trace is an imported one
+                raise undeclared(name)
+
+
+def undeclared(name: str) -> ReplayError:
+    """Return the error for a recording without declared deadlines."""
+    return ReplayError(
+        name, 'it was imported, so nothing in it says which callbacks have which deadlines',
+        'give the GRAPH')
+
+
+def has_declaration(path: str | os.PathLike[str], name: str | None = None) -> bool:
+    """Return whether a trace declares deadlines."""
+    with named_errors(os.fspath(path), name or os.fspath(path)):
+        head = read_head(TraceReader(path))
+        return head is not None and is_declared(head)

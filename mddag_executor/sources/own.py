@@ -1,0 +1,407 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reads a trace of this executor into a recording.
+
+Theory of operation
+-------------------
+1. The file is read chunk by chunk, in the order of the file.  Whole chunks before damage are used.
+   No event is dropped because of its time.
+2. ``executions`` joins the events of executions.
+3. A publication belongs to the execution that ran in its thread at that time, or of several that
+   ended or started then, to the first one that is completed after it in the file.
+4. The core processed events in the order of their times, equal times in the order of the file.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+import re
+from typing import Any
+
+from mddag_executor.core import NEVER
+from mddag_executor.memory import give_back
+from mddag_executor.recording.columns import concatenate, Growing, rows, Table
+from mddag_executor.recording.entities import Entities, OWN_INIT_EVENTS, signed
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import (
+    ABORTED,
+    DEMOTIONS,
+    DROPS,
+    earliest,
+    EXPIRED,
+    FAILED,
+    Ints,
+    JOB_ENDS,
+    LOSSES,
+    Mask,
+    MISSES,
+    OUTDATED,
+    PUBLICATIONS,
+    Recording,
+    RELEASES,
+    rows_by,
+    sort_by,
+    STOPS,
+    UNKNOWN,
+)
+from mddag_executor.sources.executions import (
+    Columns,
+    COMPLETE,
+    DISPATCH,
+    END,
+    ExecutionJoin,
+    Numbering,
+    PARTS,
+    running_at,
+)
+from mddag_executor.sources.head import declared, named_errors, no_end, TASK_SET
+from mddag_executor.text import counted
+from mddag_executor.trace import TraceReader
+from mddag_executor.trace.errors import renamed
+from mddag_executor.trace.events import Batch, Event
+from mddag_executor.trace.schema import EVENTS, PREAMBLE
+import numpy as np
+
+_PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
+(_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
+ _JUDGE_FROM, _MESSAGES_LOST) = (
+    f'mddag:{name}' for name in (
+        'deadline', 'demote', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop',
+        'hosted', 'shutdown', 'judge_from', 'messages_lost'))
+_FIELDS = {
+    DISPATCH: 'vtid callback dag vertex job worker ready',
+    END: 'vtid callback',
+    COMPLETE: 'vtid callback dag vertex job last_leg completed leg cpu_time held_interpreter',
+    _PUBLISH: 'vtid publisher_handle', _RELEASE: 'dag job release',
+    _DEADLINE: 'dag vertex job deadline completed', _DEMOTE: 'dag vertex job',
+    _FAIL: 'dag vertex job', _EXPIRE: 'dag job', _ABORT: 'dag job', _OUTDATE: 'dag job',
+    _LOST: 'count', _MESSAGES_LOST: 'callback count', _STOP: 'begin end',
+    _JUDGE_FROM: 'release', _SHUTDOWN: 'end'}
+"""The used fields of events that have only numbers."""
+_ROWS = {name: np.dtype([(field, 'i8') for field in ('place', 'timestamp', *fields.split())])
+        for name, fields in _FIELDS.items()}
+"""By kind of event the type of its rows; ``place`` is the position in the file."""
+_JOB_ENDS = {_EXPIRE: EXPIRED, _ABORT: ABORTED, _FAIL: FAILED, _OUTDATE: OUTDATED}
+_CORE = (_RELEASE, _DEADLINE, *_JOB_ENDS)
+"""Events that the executor's core processed: the run lasts at least until the last of them."""
+
+_VERTEX = re.compile('[0-9]{1,9}')
+
+Progress = Callable[[int], None]
+
+
+def read_own(
+    reader: TraceReader, name: str, head: Head, progress: Progress | None = None
+) -> Recording:
+    """
+    Return the recording of a trace of this executor.
+
+    :param name: the trace's name in messages.
+    :param head: head of the trace.
+    :param progress: called regularly with the number of events read.
+    """
+    with named_errors(reader.path, name):
+        source = _Source(reader, name, head, Entities(by_address=True))
+        found = source.read(progress)
+        found.warnings = [*source.doubts(), *end_lines(found)]
+    del source      # it holds more than the tables
+    give_back()
+    return found
+
+
+def read_process(
+    reader: TraceReader, name: str, head: Head, who: Entities, edit: Callable[[Event], Event],
+    progress: Progress | None = None,
+) -> tuple[Recording, Ints]:
+    """
+    Return the recording of one of several processes.
+
+    :param who: receives the nodes and callbacks; ``edit``: changes initialisation events.
+    :return: the recording; and the times of the core's events, by position in the order.
+    """
+    with named_errors(reader.path, name):
+        source = _Source(reader, name, head, who, edit)
+        found = source.read(progress)
+        found.warnings = source.doubts()
+        return found, source.seen_at
+
+
+def end_lines(found: Recording) -> list[str]:
+    """Return missing data of the run as a whole, one line each."""
+    name, lines = found.name, []
+    if not found.shut_down:
+        lines.append(no_end(name))
+    if found.lost:
+        lines.append(
+            f'{name}: {counted(found.lost, "event")} lost while recording: jobs may be '
+            'missing, or count as late that were not')
+    if not len(found.releases):
+        lines.append(f'{name}: no job was released in it')
+    return lines
+
+
+class _Source:
+    """Reads one trace."""
+
+    def __init__(
+        self, reader: TraceReader, name: str, head: Head, who: Entities,
+        edit: Callable[[Event], Event] | None = None,
+    ) -> None:
+        self._reader, self._name, self._head, self._edit = reader, name, head, edit
+        self._task_set = declared(head, name)
+        self._numbering = Numbering(self._task_set)
+        self._strange: Counter[str] = Counter()
+        self._executions = ExecutionJoin(_ROWS[COMPLETE], self._numbering, self._strange)
+        self._who = who
+        # rows of the other events
+        self._kinds = {name: Growing(kind) for name, kind in _ROWS.items() if name not in PARTS}
+        self._last_seen = 0
+        self._others: list[tuple[int, Event]] = []
+
+    def read(self, progress: Progress | None) -> Recording:
+        count = 0
+        for batch in self._reader.batches({
+                *_ROWS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED}):
+            self._take(batch)
+            count += batch.n_events
+            if progress is not None:
+                progress(count)
+        give_back()     # memory of the batches
+        return self._recording()
+
+    # --- batches ---------------------------------------------------------------------------------
+
+    def _take(self, batch: Batch) -> None:
+        """Store the events of a batch, executions as rows."""
+        parts: dict[str, list[tuple[Table, Ints]]] = {}
+        for (name, *_), table, places in batch.tables:
+            if name in _ROWS:
+                parts.setdefault(name, []).append((table, places))
+            else:
+                self._others += [(place, (name, *row)) for place, row in zip(
+                    places.tolist(), table.tolist())]
+        for place, event in batch.others:
+            if None in event:
+                self._strange[f'{event[0]} without some of its fields'] += 1
+            elif event[0] in _ROWS:
+                parts.setdefault(event[0], []).append((_one_row(event), np.array([place])))
+            else:
+                self._others.append((place, event))
+        self._executions.add(parts)
+        for name, found in parts.items():
+            if name not in PARTS:
+                self._kinds[name].add(Columns(found).rows(_ROWS[name]))
+
+    def _pop(self, name: str) -> Table:
+        """Return the rows of a kind of event; forget them."""
+        table = self._kinds.pop(name).table()
+        if name in _CORE:
+            self._last_seen = max(self._last_seen, int(table['timestamp'].max(initial=0)))
+        return table
+
+    # --- putting together ------------------------------------------------------------------------
+
+    def _recording(self) -> Recording:
+        head, task_set = self._head, self._task_set
+        found = Recording(
+            self._name, head, task_set, task_set, self._who, workers_each=head.workers)
+        self._entities()
+        found.executions, completed = self._executions.tables()
+        self._last_seen = self._executions.last
+        found.publications = self._publications(found.executions, completed)
+        found.releases, released_at = self._releases(self._pop(_RELEASE))
+        found.job_ends, ends_at = self._job_ends()
+        found.misses = self._at_vertices(
+            _DEADLINE, MISSES, job='job', deadline='deadline', completed='completed')
+        found.demotions = self._at_vertices(_DEMOTE, DEMOTIONS, job='job', time='timestamp')
+        losses = self._pop(_MESSAGES_LOST)
+        found.losses = rows(LOSSES, len(losses), callback=losses['callback'],
+                            time=losses['timestamp'], count=losses['count'])
+        stops = self._pop(_STOP)
+        found.notices_stops = earliest(stops['end'])
+        stops = stops[stops['begin'] < stops['end']]    # the first one is empty: stops are noticed
+        found.stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
+        found.lost = sum(self._pop(_LOST)['count'].tolist())
+        self._set_end(found)
+        self._put_in_order(found, [
+            (found.releases, found.releases['noticed'], released_at),
+            (found.job_ends, found.job_ends['time'], ends_at)], completed)
+        found.start = earliest(found.releases['release'], found.executions['ready'][
+            (found.executions['end'] >= 0) & (found.executions['start'] >= 0)])
+        return found
+
+    def _entities(self) -> None:
+        self._others.sort(key=lambda each: each[0])
+        for _, event in self._others:
+            if event[0] in OWN_INIT_EVENTS:
+                self._who.take(event if self._edit is None else self._edit(event))
+            elif event[0] == TASK_SET and event[4] != self._head.yaml:
+                self._strange[f'{TASK_SET} with another declaration'] += 1
+
+    def _publications(self, executions: Table, completed: Table) -> Table:
+        published = self._pop(_PUBLISH)
+        time = published['timestamp']
+        if (time[1:] < time[:-1]).any():
+            published = published[sort_by(time)]
+            time = published['timestamp']
+        by = running_at(executions, completed, published['vtid'], time, published['place'])
+        table = rows(
+            PUBLICATIONS, len(published), publisher=published['publisher_handle'],
+            execution=by, vertex=UNKNOWN, time=time, source_timestamp=UNKNOWN)
+        known = by >= 0     # a killed run may have publications, and no execution
+        table['vertex'][known] = executions['vertex'][by[known]]
+        return table
+
+    def _releases(self, released: Table) -> tuple[Table, Ints]:
+        """Return the releases, and their positions in the file."""
+        released = released[sort_by(released['timestamp'], released['place'])]
+        good = (released['dag'] >= 0) & (released['dag'] < len(self._task_set.dags))
+        self._left_out(_RELEASE, 'of a DAG that is not declared', ~good)
+        again = np.zeros(len(released), dtype=np.bool_)
+        for mine in rows_by(np.where(good, released['dag'], -1), len(self._task_set.dags)):
+            newest = np.maximum.accumulate(np.r_[-1, released['job'][mine]])
+            again[mine] = released['job'][mine] <= newest[:-1]
+        self._left_out(_RELEASE, 'of a job that is not newer than the last', again)
+        good &= ~again
+        released = released[good]
+        release, noticed = released['release'], released['timestamp']
+        to_come = (release < 0) | (release > noticed)
+        self._left_out(_RELEASE, 'of a release that is still to come', to_come)
+        return rows(
+            RELEASES, len(released), dag=released['dag'], job=released['job'],
+            release=np.where(to_come, noticed, release), noticed=noticed), released['place']
+
+    def _left_out(self, name: str, why: str, which: Mask) -> None:
+        count = int(which.sum())
+        if count:
+            self._strange[f'{name} {why}'] += count
+
+    def _job_ends(self) -> tuple[Table, Ints]:
+        tables, places = [rows(JOB_ENDS)], [np.empty(0, dtype=np.int64)]
+        for kind, reason in _JOB_ENDS.items():
+            found = self._pop(kind)
+            good = (found['dag'] >= 0) & (found['dag'] < len(self._task_set.dags))
+            self._left_out(kind, 'of a DAG that is not declared', ~good)
+            vertex = np.full(len(found), UNKNOWN)
+            if kind == _FAIL:
+                vertex = self._numbering.of(found['dag'], found['vertex'])[1]
+                good &= vertex >= 0
+            tables.append(rows(
+                JOB_ENDS, int(good.sum()), dag=found['dag'][good], vertex=vertex[good],
+                job=found['job'][good], time=found['timestamp'][good], reason=reason))
+            places.append(found['place'][good])
+        return concatenate(tables), np.concatenate(places)
+
+    def _at_vertices(self, name: str, kind: np.dtype[Any], **fields: str) -> Table:
+        """Return events as rows of a type; ``fields``: by column the field of the events."""
+        found = self._pop(name)
+        dag, vertex = self._numbering.of(found['dag'], found['vertex'])
+        return rows(kind, len(found), dag=dag, vertex=vertex, **{
+            column: found[field] for column, field in fields.items()})
+
+    def _set_end(self, found: Recording) -> None:
+        """Find the end of the run, and process events that are not in tables."""
+        last = self._last_seen
+        drops, reasons, hosted = [], dict[str, int](), []
+        for place, event in self._others:
+            if event[0] == _DROP:
+                _, now, _, _, _, dag, vertex, job, reason = event
+                number = reasons.setdefault(reason, len(reasons))
+                drops.append((
+                    self._numbering.one(dag, vertex), signed(job), signed(now), number))
+            elif event[0] == _HOSTED:
+                vertices = self._hosted(event)
+                if vertices is not None:
+                    hosted.append((event[1], place, event[4], vertices))
+            if event[0] in (_DROP, _HOSTED):
+                last = max(last, event[1])
+        vertex, job, time, reason = zip(*drops) if drops else ((), (), (), ())
+        found.drops = rows(DROPS, len(drops), vertex=vertex, job=job, time=time, reason=reason)
+        found.drop_reasons = tuple(reasons)
+        judging = self._pop(_JUDGE_FROM)
+        last = max(last, int(judging['timestamp'].max(initial=0)))
+        possible = (judging['release'] >= 0) & (judging['release'] <= NEVER)
+        self._left_out(_JUDGE_FROM, 'an impossible time', ~possible)
+        judging = judging[possible]
+        for place in sort_by(judging['timestamp'])[-1:]:
+            found.judge_from = int(judging['release'][place])
+        self._hosting = sorted(hosted, key=lambda h: h[:2])
+        last = min(last, NEVER - 1)     # a run without end cannot be rescheduled
+        found.end = found.judged_until = last
+        self._shutdown_at: tuple[int, int] | None = None
+        shutdown = self._pop(_SHUTDOWN)
+        if len(shutdown):
+            now, judged = int(shutdown['timestamp'][0]), int(shutdown['end'][0])
+            if last <= now < NEVER and 0 <= judged <= now:
+                found.end, found.judged_until, found.shut_down = now, judged, True
+                self._shutdown_at = now, int(shutdown['place'][0])
+            else:
+                self._strange[f'{_SHUTDOWN} at an impossible time'] += 1
+        if found.end == 0:
+            found.end = found.judged_until = min(max(0, self._head.time), NEVER - 1)
+
+    def _hosted(self, event: Event) -> frozenset[int] | None:
+        dag, text = event[4:6]
+        words = text.split(',') if text else []
+        found = [self._numbering.one(dag, int(word)) if _VERTEX.fullmatch(word) else -1
+                 for word in words]
+        if not 0 <= dag < len(self._task_set.dags) or -1 in found:
+            self._strange[f'{_HOSTED} of a vertex that is not declared'] += 1
+            return None
+        return frozenset(found)
+
+    def _put_in_order(
+        self, found: Recording, core: list[tuple[Table, Any, Ints]], completed: Table
+    ) -> None:
+        """Assign positions in the order to the core's events (rule 4)."""
+        single = [(time, place) for time, place, *_ in self._hosting]
+        if self._shutdown_at is not None:
+            single.append(self._shutdown_at)
+        some = np.array(single, dtype=np.int64).reshape(-1, 2)
+        times = np.concatenate([completed['time'], *(each for _, each, _ in core), some[:, 0]])
+        places = np.concatenate([completed['place'], *(at for _, _, at in core), some[:, 1]])
+        in_order = sort_by(times, places)
+        del places
+        self._seen = times, in_order
+        rank = np.empty(len(times), dtype=np.int32)
+        rank[in_order] = np.arange(len(times), dtype=np.int32)
+        found.executions['order'][completed['row']] = rank[:len(completed)]
+        at = len(completed)
+        for table, _, _ in core:
+            table['order'] = rank[at:at + len(table)]
+            at += len(table)
+        ranks = iter(rank[at:].tolist())
+        found.hosted = [(next(ranks), dag, vertices) for *_, dag, vertices in self._hosting]
+        if self._shutdown_at is not None:
+            found.judged_order = next(ranks)
+
+    @property
+    def seen_at(self) -> Ints:
+        """Return the times of the core's events, by position in the order."""
+        times, in_order = self._seen
+        return times[in_order]
+
+    def doubts(self) -> list[str]:
+        """Return defects of the trace, one line each."""
+        name, path = self._name, self._reader.path
+        lines = [renamed(text, path, name) for text in self._reader.warnings]
+        if self._strange:
+            what, n = min(self._strange.items(), key=lambda item: (-item[1], item[0]))
+            lines.append(
+                f'{name}: left out: {counted(sum(self._strange.values()), "event")} that make no '
+                f'sense, most often ({n}) {what}')
+        orphans = self._executions.orphans
+        if orphans:
+            lines.append(
+                f'{name}: {counted(orphans, "completed execution")} whose start is not in it')
+        return lines
+
+
+def _one_row(event: Event) -> Table:
+    """Return an event, a tuple with the fields of the table, as a row."""
+    kind = _ROWS[event[0]]
+    fields = [name for name, _ in (*PREAMBLE, *EVENTS[event[0]].fields)]
+    values = dict(zip(fields, event[1:]))
+    return rows(kind, 1, **{name: values[name] for name in (kind.names or ())[1:]})

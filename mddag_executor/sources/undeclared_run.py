@@ -1,0 +1,218 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A trace of this executor without declaration, judged by a declaration that is given later.
+
+Theory of operation
+-------------------
+Such a trace names no jobs, so jobs are made as for imported recordings (``imported_run``), from
+the causes of executions.  Differences:
+
+1. *Messages to executions.*  ``rmw_take`` is recorded when any thread takes a message;
+   ``dispatch`` has the ready time, which is right after it.  So an execution belongs to the last
+   message that its subscription took until then.
+2. *Publications to messages.*  A publication is recorded just before sending; its source timestamp
+   is not recorded.  A timestamp belongs to a publication of its topic that was being sent then: it
+   had begun, and its thread had neither published again nor ended its callback.  If several
+   publications fit, the number of the message decides (``stamps``).
+3. *Ready* is recorded.  A timer's release is the last time on its period's grid.  The grid's
+   origin is not recorded.  It is the earliest time at which the timer was noticed, if half of the
+   releases on that grid were noticed shortly after they were due; otherwise a release is the time
+   at which it was noticed.
+4. The pieces of a coroutine became ready at the same time.  They are one execution, which
+   completes at the end of the last piece.
+"""
+
+from __future__ import annotations
+
+from mddag_executor.recording.columns import rows
+from mddag_executor.recording.entities import INIT_EVENTS
+from mddag_executor.recording.tables import (
+    DROPS,
+    find_pairs,
+    Ints,
+    LOSSES,
+    Mask,
+    NOTHING,
+    Recording,
+    rows_by,
+    sort_by,
+    UNKNOWN,
+)
+from mddag_executor.sources.executions import number_pieces
+from mddag_executor.sources.head import no_end
+from mddag_executor.sources.imported_events import (
+    END,
+    KINDS,
+    OWN_KINDS,
+    READY,
+    SHUTDOWN,
+    START,
+    TAKE,
+)
+from mddag_executor.sources.imported_jobs import ImportedJobs
+from mddag_executor.sources.imported_run import ImportedRun
+from mddag_executor.sources.links import Links
+from mddag_executor.sources.stamps import find_stamps, Sent
+from mddag_executor.trace.times import NEVER
+import numpy as np
+
+_DROP, _MESSAGES_LOST = 'mddag:drop', 'mddag:messages_lost'
+# A timer is noticed shortly after its release within both: a time, and a part of its period.
+_SOON_NS, _SOON_PART = 1_000_000, 10
+
+
+class _OwnLinks(Links):
+    """The executions and messages of this executor (rules 1 and 2)."""
+
+    def _stamp_messages(self) -> Ints:
+        """Find the source timestamps of publications (rule 2)."""
+        table, found = self.events, self.messages
+        kind = table['kind']
+        sent = np.zeros(len(table), dtype=np.bool_)
+        sent[found['at']] = True
+        # a publication is being sent until the next one, or until the callback ends
+        ends = np.full(len(found), NEVER)
+        stops = sent | (kind <= END)
+        before = self._last(stops, stops)
+        at = np.flatnonzero(stops)
+        mine = (before >= 0) & sent[before]
+        ends[self._row[before[mine]]] = table['time'][at[mine]]
+        takes = np.flatnonzero((kind == TAKE) & (self._subscription >= 0))
+        topics = self._numbers(each[0].start for each in self.taken)[self._subscription[takes]]
+        # several subscriptions may take a message: its first take counts
+        order = sort_by(topics, table['b'][takes])
+        stamps = table['b'][takes[order]]
+        new = np.append(True, (np.diff(topics[order]) != 0) | (np.diff(stamps) != 0))[:len(takes)]
+        first = np.sort(order[new])
+        takes, topics = takes[first], topics[first]
+        several: list[tuple[int, int]] = []
+        for topic, (mine, asked) in enumerate(zip(*(
+                rows_by(each, len(self.topics) + 1) for each in (self.topic_of, topics)))):
+            at = takes[asked]
+            found['stamp'][mine], doubtful = find_stamps(
+                Sent(found['time'][mine], ends[mine], found['publisher'][mine]),
+                table['b'][at], table['d'][at])
+            several += [(topic, stamp) for stamp in doubtful]
+        return np.array(several, dtype=np.int64).reshape(-1, 2)
+
+    def _takes(self) -> tuple[Ints, Ints]:
+        none = np.empty(0, dtype=np.int64)      # the executor takes messages in any thread
+        return none, none
+
+    def _arrivals(self) -> Ints:
+        """Find the taken message of each execution (rule 1)."""
+        table = self.events
+        kind, time = table['kind'], table['time']
+        takes, ready = kind == TAKE, kind == READY
+        #: By event of a dispatch the event of the taken message, or -1.
+        self._taken_at = np.full(len(table), -1)
+        taken, dispatched = np.flatnonzero(takes), np.flatnonzero(ready)
+        takes_by = rows_by(self._subscription[taken], len(self.taken))
+        ready_by = rows_by(self._callback[dispatched], len(self.callbacks))
+        subscriptions: dict[int, list[int]] = {}
+        for number, callbacks in enumerate(self.taken):
+            for one in {id(callback) for callback in callbacks}:
+                subscriptions.setdefault(one, []).append(number)
+        for callback, those in zip(self.callbacks, ready_by):
+            mine = np.sort(np.concatenate([taken[:0], *(
+                taken[takes_by[each]] for each in subscriptions.get(id(callback), ()))]))
+            these = dispatched[those] if len(mine) else mine
+            place = np.searchsorted(time[mine], table['b'][these], 'right') - 1
+            these, place = these[place >= 0], place[place >= 0]
+            # a message starts one execution; its pieces have the same ready time
+            _, first, which = np.unique(place, return_index=True, return_inverse=True)
+            same = table['b'][these] == table['b'][these[first[which]]]
+            self._taken_at[these[same]] = mine[place[same]]
+        starts = kind == START
+        last = self._last(ready | starts, starts)
+        known = (last >= 0) & ready[last]
+        start = self.runs['start']
+        self.runs['ready'] = np.where(known, np.clip(table['b'][last], 0, start), start)
+        found: Ints = np.where(known, self._taken_at[last], -1)
+        return found
+
+
+class UndeclaredRun(ImportedRun):
+    """A run of this executor that was recorded without a declaration."""
+
+    kinds = {**KINDS, **OWN_KINDS}
+    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST)
+    links_type = _OwnLinks
+
+    def read(self) -> Recording:
+        """Return the recording."""
+        found = super().read()
+        table = found.executions
+        number_pieces(table, np.arange(len(table)), 'callback', table['completes'] == NOTHING)
+        found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
+        if not found.shut_down:
+            found.warnings.append(no_end(self.name))
+        drops, reasons, losses = [], dict[str, int](), []
+        for event in self._events.others:
+            if event[0].name not in (_DROP, _MESSAGES_LOST):
+                continue
+            _, time, pid, _, *values = event
+            fields = dict(zip(event[0].fields, values))
+            callback = self.who.callbacks.latest(pid, fields.get('callback', 0), time)
+            number = UNKNOWN if callback is None else callback.number
+            if 'reason' in fields:
+                drops.append((self._vertex.get(number, UNKNOWN), time,
+                              reasons.setdefault(str(fields['reason']), len(reasons))))
+            elif isinstance(fields.get('count'), int):
+                losses.append((number, time, fields['count']))
+        vertex, times, reason = zip(*drops) if drops else ((), (), ())
+        found.drops = rows(
+            DROPS, len(drops), vertex=vertex, job=UNKNOWN, time=times, reason=reason)
+        found.drop_reasons = tuple(reasons)
+        callbacks, times, count = zip(*losses) if losses else ((), (), ())
+        found.losses = rows(LOSSES, len(losses), callback=callbacks, time=times, count=count)
+        return found
+
+    def _judged_until(self) -> int:
+        table = self._events.table
+        ends = table['a'][table['kind'] == SHUTDOWN]
+        return int(ends[-1]) if len(ends) else self.end
+
+    def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
+        number, ready = self.links.runs['callback'], self.links.runs['ready'].copy()
+        for callback, mine in zip(
+                self.links.callbacks, rows_by(number, len(self.links.callbacks))):
+            times = np.unique(ready[mine])
+            if callback.kind == 'timer' and len(times):
+                callback.grid = _grid(times, callback.period)
+        # the time at which a request was taken is not recorded
+        release = self._releases(jobs, ready, 'timer', 'service')
+        timer = self._is_any('timer')[number[jobs.sources]]
+        mine = jobs.sources[timer]
+        release[timer] = self._due(mine, ready[mine])
+        return ready, release
+
+    def _pieces(self) -> tuple[Ints, Mask]:
+        """Return the first pieces of executions, and which end them (rule 4)."""
+        runs = self.links.runs
+        pairs = runs['callback'], runs['ready']
+        first, _ = find_pairs(pairs, pairs)
+        newest, lost = np.full(len(runs), UNKNOWN), np.zeros(len(runs), dtype=np.bool_)
+        np.maximum.at(newest, first, runs['end_at'])
+        lost[first[runs['end_at'] < 0]] = True
+        return first, (runs['end_at'] == newest[first]) & ~lost[first]
+
+
+def _grid(ready: Ints, period: int) -> int | None:
+    """
+    Return a time on the grid of a timer's releases, before them; None: no grid (rule 3).
+
+    :param ready: when it was noticed.
+    """
+    if not 0 < period < NEVER:
+        return None
+
+    def late(since: int) -> Ints:
+        found: Ints = (ready - since + period // 2) % period - period // 2
+        return found
+
+    usual = int(ready[0]) + int(np.median(late(int(ready[0]))))
+    first = usual + int(late(usual).min())
+    soon = (ready - first) % period <= min(_SOON_NS, period // _SOON_PART)
+    return first - 2 * period if 2 * soon.sum() >= len(ready) else None

@@ -1,0 +1,58 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Ordinary bags rescheduled: recorded sensor messages as releases, declared execution times.
+
+Theory of operation
+-------------------
+* The releases are those of ``bag_run``.
+* Execution times are drawn for each execution from the declared quantiles (seeded), or come from a
+  table, fixed for the whole run.
+* Data that a bag does not have is ignored, and reported: transport, dispatch, other load of the
+  machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import os
+import random
+from typing import Any
+
+from mddag_executor.simulate.workload import check_execution_times
+from mddag_executor.sources.bag_run import read_bag
+from mddag_executor.whatif.reschedule import Reschedule, reschedule
+from msg_graph import Dag, TaskSet
+import numpy as np
+
+
+def reschedule_bag(
+    path: str | os.PathLike[str], task_set: TaskSet, *,
+    times: Sequence[Sequence[int]] | None = None, seed: int = 0, name: str | None = None,
+    **options: Any,
+) -> Reschedule:
+    """
+    Run the core with the messages of an ordinary bag.
+
+    :param path: a bag's folder, or one of its files.
+    :param times: execution times by DAG and vertex, ns; None: drawn from the declared ones.
+    :param options: as for ``reschedule``; a bag has no overheads.
+    """
+    if times is None:
+        check_execution_times(task_set, ', or give --execution-times FILE')
+    run = read_bag(path, task_set, name)
+    counts = np.bincount(run.releases['dag'], minlength=len(task_set.dags)).tolist()
+    generator = random.Random(seed)
+    return reschedule(run, times=[
+        np.array([_drawn(dag, generator) for _ in range(count)], dtype=np.int64)
+        if times is None else np.tile(np.array(times[dag.index], dtype=np.int64), (count, 1))
+        for dag, count in zip(task_set.dags, counts)], overheads=False, **options)
+
+
+def _drawn(dag: Dag, generator: random.Random) -> Sequence[int]:
+    row = []
+    for vertex in dag.vertices:
+        declared = vertex.callback.execution_time
+        assert declared is not None     # checked before
+        row.append(declared.draw(generator.random()))
+    return row

@@ -1,0 +1,336 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A computed schedule as the recording of a run.
+
+Theory of operation
+-------------------
+The simulator and the rescheduler keep a log: which worker began, ended or preempted which vertex,
+and when.  With the load and the ends of jobs decided by the core this contains all data of a
+recording.  So every analysis works as on a recording and finds the same verdicts.
+
+At the same instant ends of executions come first, then early ends of jobs, then releases, then
+starts, then ends of executions that took no time.  A vertex is ready when the last message that it
+needs has arrived: at the end of the publishing execution, shifted by the delays of the load.  A
+preempted execution has several pieces, like a suspended coroutine.  A sync callback runs once for
+all of its legs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from mddag_executor.analysis.paths import Paths
+from mddag_executor.analysis.requirements import Requirements
+from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, Tables
+from mddag_executor.core.state import (
+    Decision,
+    DROP,
+    EXPIRED,
+    JOB_END,
+    OUTDATED,
+    SINK_DEMOTED,
+)
+from mddag_executor.recording import tables
+from mddag_executor.recording.columns import rows as table_of
+from mddag_executor.recording.columns import Table
+from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.head import Head
+from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by, UNKNOWN
+from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
+from mddag_executor.simulate.load import edge_numbers, FAILS
+from mddag_executor.sources.executions import Numbering
+from msg_graph import TaskSet
+import numpy as np
+
+_DROPS = -1, EXPIRED      # ends of jobs, in the order of the drop reasons
+_REASONS = {EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
+"""Reasons, in terms of a recording, why jobs ended early."""
+
+
+class ComputedRun(NamedTuple):
+    """
+    A computed schedule.
+
+    :ivar horizon: no job is released then or later, ns.
+    :ivar end: when it ended, ns; open jobs are then judged if ``judged``.
+    :ivar numbers: by DAG the recorded numbers of the load's jobs; None: as in the load.
+    :ivar judge_from: jobs released before are not judged; ``judged_releases``: range of judged
+        releases, ns; None: all.
+    """
+
+    task_set: TaskSet
+    load: Load
+    log: Sequence[LogEntry]
+    decisions: Sequence[Decision]
+    horizon: int
+    end: int
+    judged: bool = True
+    numbers: Sequence[Sequence[int]] | None = None
+    judge_from: int = -NEVER
+    judged_releases: tuple[int, int] | None = None
+
+    @classmethod
+    def of_run(cls, task_set: TaskSet, load: Load, run: SimulatedRun) -> ComputedRun:
+        """Return a run that was simulated with its log."""
+        horizon = run.settings.duration_ns
+        stopped = run.settings.stop_at_first_miss and run.ended_ns < horizon
+        judged = run.settings.judge == 'horizon' and not stopped
+        return cls(task_set, load, run.log, run.decisions, horizon, run.ended_ns, judged)
+
+    def recording(self, workers: int = 0) -> Recording:
+        """
+        Return the schedule as a recording.
+
+        :param workers: number of workers.
+        """
+        task_set, found = self.task_set, _Tables(self)
+        who = Entities(by_address=True)
+        who.note('ros2:rclcpp_callback_register', {
+            '_timestamp': 0, '_vpid': 0, 'callback': 0, 'symbol': 'undeclared callbacks'})
+        releases, executions, job_ends = found.in_order()
+        return Recording(
+            task_set.file, Head(0, task_set.text, task_set.file, '', workers,
+                                DEFAULT_DEADLINE_NS, 0, False),
+            task_set, task_set, who, same=False, releases=releases, executions=executions,
+            job_ends=job_ends, drops=found.drops(), drop_reasons=('newer', 'expired'),
+            demotions=found.demotions(), unsent=found.unsent(),
+            start=tables.earliest(releases['release'], executions['ready']),
+            end=self.end, judged=self.judged, judged_until=self.end, workers_each=workers,
+            judge_from=self.judge_from, judged_releases=self.judged_releases)
+
+    def requirements(self) -> dict[str, Any]:
+        """Return ``paths`` and ``requirements`` of the result; nothing if nothing is required."""
+        if not any(path.requirements for path in self.task_set.paths):
+            return {}
+        recording = self.recording()
+        paths = Paths(recording, self.judge_from)
+        return {'paths': paths.results(),
+                'requirements': Requirements(recording, paths, self.judge_from).result()}
+
+
+class _Pieces(NamedTuple):
+    """
+    Columns by piece of an execution, in the order of vertex, job and start.
+
+    ``begins``, ``ends``: rows of the log, ``ends`` is -1 if it still ran; ``first``: the first
+    piece of the execution; ``ended``: whether it is the last one; ``end`` is 0 if it still ran.
+    """
+
+    dag: Ints
+    vertex: Ints
+    job: Ints
+    worker: Ints
+    begins: Ints
+    ends: Ints
+    start: Ints
+    end: Ints
+    first: Ints
+    ended: Any
+
+
+def _columns(rows: Sequence[tuple[int, ...]]) -> Ints:
+    """Return the six columns of log entries or decisions."""
+    found: Ints = np.asarray(rows, dtype=np.int64).reshape(-1, 6).T
+    return found
+
+
+class _Tables:
+    """Makes the tables of the recording."""
+
+    def __init__(self, schedule: ComputedRun) -> None:
+        self._schedule = schedule
+        self._load: Any = Load(*(np.asarray(each, dtype=np.int64)  # type: ignore[arg-type]
+                                 for each in schedule.load))
+        self._tables = Tables.build(schedule.task_set)
+        self._n_dags = self._tables.n_dags
+        self._log = _columns(schedule.log)
+        self._decisions = _columns(schedule.decisions)
+
+    @cached_property
+    def _pieces(self) -> _Pieces:
+        now, kind, worker, dag, vertex, job = self._log
+        rows = sort_by(vertex, job)     # of each execution starts and stops alternate
+        at = np.flatnonzero(kind[rows] == START)
+        after = np.r_[rows, -1][at + 1]
+        ends = np.where((after >= 0) & (kind[after] != START), after, -1)
+        begins = rows[at]
+        dag, vertex, job, worker = (each[begins] for each in (dag, vertex, job, worker))
+        new = np.r_[True, (vertex[1:] != vertex[:-1]) | (job[1:] != job[:-1])][:len(at)]
+        return _Pieces(
+            dag, vertex, job, worker, begins, ends, now[begins],
+            np.where(ends >= 0, now[ends], 0), np.flatnonzero(new)[np.cumsum(new) - 1],
+            (ends >= 0) & (kind[ends] == END))
+
+    def _numbers(self, dag: Ints, job: Ints) -> Ints:
+        """Return the recorded numbers of jobs."""
+        found = job.copy()
+        for number, recorded in enumerate(self._schedule.numbers or ()):
+            mine = dag == number
+            found[mine] = np.asarray(recorded, dtype=np.int64)[job[mine]]
+        return found
+
+    def in_order(self) -> tuple[Table, Table, Table]:
+        """Return releases, executions and ends of jobs, with their positions in the order."""
+        load, pieces = self._load, self._pieces
+        done = np.flatnonzero(pieces.ended & (pieces.dag < self._n_dags))
+        done = done[sort_by(pieces.ends[done])]
+        rank = self._ranks(pieces.ends[done])
+        failed = self._fails(done)
+        early = self._early_ends()
+        released = np.flatnonzero(
+            (load.times < self._schedule.horizon) & (load.times <= self._schedule.end)
+            & (load.dags < self._n_dags))
+        # time, rank at that time, row of the log, position
+        keys: list[tuple[Any, ...]] = [
+            (pieces.end[done], rank, pieces.ends[done], 1),
+            (pieces.end[done[failed]], rank[failed], pieces.ends[done[failed]], 0),
+            (early[3], 1, -1, np.arange(len(early[3]))),
+            (load.times[released], 1, 0, np.arange(len(released)))]
+        order = np.argsort(sort_by(*np.concatenate(
+            [np.array(np.broadcast_arrays(*key)) for key in keys], axis=1))) + 1
+        completions, failures, ends, releases = np.split(
+            order, np.cumsum([len(key[0]) for key in keys])[:-1])
+        completed = np.full(len(pieces.begins), UNKNOWN)
+        completed[done] = completions
+        return (self._releases(released, releases), self._executions(completed),
+                self._job_ends(done[failed], failures, early, ends))
+
+    def _ranks(self, rows: Ints) -> Ints:
+        """Return which ends, by row of the log, come after a start at the same time: 2, else 0."""
+        now, kind = self._log[:2]
+        others = np.r_[np.flatnonzero(kind != END), len(kind)]
+        first = others[np.searchsorted(now[others[:-1]], now[rows])]
+        return np.where((first < rows) & (now[np.minimum(first, len(now) - 1)] == now[rows]), 2, 0)
+
+    def _fails(self, done: Ints) -> Ints:
+        """Return which of the completions are failures."""
+        load, pieces = self._load, self._pieces
+        if not len(load.fates):
+            return done[:0]
+        dag = pieces.dag[done]
+        local = np.array(self._tables.index_in_dag)[pieces.vertex[done]]
+        return np.flatnonzero(load.fates[
+            load.cost_base[dag] + pieces.job[done] * load.cost_stride[dag] + local] == FAILS)
+
+    def _early_ends(self) -> Ints:
+        """Return early ends of jobs: DAG, job, reason, time."""
+        kind, dag, _, job, how, time = self._decisions
+        rows = np.flatnonzero(
+            (kind == JOB_END) & np.isin(how, list(_REASONS)) & (dag < self._n_dags))
+        reasons = np.array([_REASONS[each] for each in how[rows].tolist()], dtype=np.int64)
+        return np.array([dag[rows], job[rows], reasons, time[rows]])
+
+    def _releases(self, rows: Ints, order: Ints) -> Table:
+        load = self._load
+        dag, times = load.dags[rows], load.times[rows]
+        return table_of(
+            tables.RELEASES, len(rows), dag=dag, job=self._numbers(dag, load.jobs[rows]),
+            release=load.releases[rows] if len(load.releases) else times, noticed=times,
+            order=order)
+
+    def _job_ends(self, failed: Ints, failures: Ints, early: Ints, order: Ints) -> Table:
+        pieces = self._pieces
+        dag, job, reason, time = np.concatenate([np.array(np.broadcast_arrays(
+            pieces.dag[failed], pieces.job[failed], tables.FAILED, pieces.end[failed])), early],
+            axis=1)
+        vertex = np.r_[pieces.vertex[failed], np.full(len(early[0]), UNKNOWN)]
+        found = table_of(
+            tables.JOB_ENDS, len(dag), dag=dag, vertex=vertex, job=self._numbers(dag, job),
+            time=time, reason=reason, order=np.r_[failures, order])
+        return found[sort_by(found['order'])]
+
+    def _executions(self, order: Ints) -> Table:
+        """
+        Return the executions, in the order of their ends.
+
+        :param order: by piece its position in the order, if it completes a vertex.
+        """
+        each = self._pieces
+        rows = sort_by(np.where(each.ends >= 0, each.ends, len(self._log[0]) + each.begins))
+        first, ran, completes, declared = (
+            each.first, each.ends >= 0, order >= 0, each.dag < self._n_dags)
+        total = np.cumsum(np.where(ran, each.end - each.start, 0))
+        before = np.r_[0, total][first]
+        task_set = self._schedule.task_set
+        callback = np.r_[np.array(task_set.places_of_vertices(), dtype=np.int64) + 1, 0]
+        legs = np.where(Numbering(task_set).n_legs > 1, tables.ALL_LEGS, 0)
+        return table_of(
+            tables.EXECUTIONS, len(first), callback=callback[each.vertex],
+            dag=np.where(declared, each.dag, -1), vertex=np.where(declared, each.vertex, -1),
+            job=self._numbers(each.dag, each.job), leg=np.where(completes, legs[each.vertex], 0),
+            piece=np.arange(len(first)) - first, thread=each.worker + 1, worker=each.worker,
+            ready=self._ready()[first], began=each.start[first], start=each.start,
+            end=np.where(ran, each.end, UNKNOWN), busy=np.where(ran, total - before, UNKNOWN),
+            completes=np.where(completes, tables.VERTEX, tables.NOTHING), order=order,
+            cpu=UNKNOWN, message=UNKNOWN)[rows]
+
+    def _ready(self) -> Ints:
+        """Return by piece when its execution became ready; valid for first pieces."""
+        load, each = self._load, self._pieces
+        first, vertices = np.arange(len(each.first)) == each.first, np.arange(
+            1, self._tables.n_vertices + 1)
+        of_vertex, ended_of = (np.split(rows, np.searchsorted(each.vertex[rows], vertices))
+                               for rows in map(np.flatnonzero, (first, each.ended)))
+        ready = np.full(len(first), -NEVER)
+        jobs = 1 + max(int(each.job.max(initial=0)), int(load.jobs.max(initial=0)))
+        for dag, source in enumerate(self._tables.source):
+            mine, rows = load.dags == dag, of_vertex[source]
+            times = np.full(jobs, -NEVER)
+            times[load.jobs[mine]] = load.times[mine]
+            ready[rows] = times[each.job[rows]]
+        for (before, after), edge in edge_numbers(self._tables).items():
+            ended, rows = ended_of[before], of_vertex[after]
+            at = look_up(each.job[rows], each.job[ended])
+            ended, rows = ended[at >= 0], rows[at[at >= 0]]
+            arrived = each.end[ended]
+            if len(load.delay_base):
+                dag = self._tables.dag_of[before]
+                delay = load.delays[
+                    load.delay_base[dag] + each.job[ended] * load.delay_stride[dag] + edge]
+                arrived = np.maximum(each.start[each.first[ended]], arrived + delay)
+            arrived = np.where(each.ends[ended] < each.begins[rows], arrived, -NEVER)
+            ready[rows] = np.maximum(ready[rows], arrived)
+        return np.where(ready > -NEVER, np.minimum(ready, each.start), each.start)
+
+    def drops(self) -> Table:
+        """Return the dropped executions; ``reason``: how their job had ended."""
+        kind, dag, vertex, job, end, now = self._decisions
+        ended: dict[tuple[int, int], int] = {}
+        found, reasons = [], []
+        for row in np.flatnonzero(
+                (dag < self._n_dags) & ((kind == DROP) | (kind == JOB_END) & np.isin(
+                    end, _DROPS))).tolist():
+            if kind[row] == DROP:
+                found.append(row)
+                reasons.append(ended.get((dag[row], job[row]), 0))
+            else:
+                ended[dag[row], job[row]] = _DROPS.index(end[row])
+        rows = np.array(found, dtype=np.int64)
+        return table_of(
+            tables.DROPS, len(rows), vertex=vertex[rows], job=self._numbers(dag[rows], job[rows]),
+            time=now[rows], reason=reasons)
+
+    def demotions(self) -> Table:
+        """Return the demotions of sinks."""
+        _, dag, vertex, job, _, time = self._decisions[:, self._decisions[0] == SINK_DEMOTED]
+        return table_of(tables.DEMOTIONS, len(dag), dag=dag, vertex=vertex,
+                           job=self._numbers(dag, job), time=time)
+
+    def unsent(self) -> dict[tuple[int, int], Ints]:
+        """Return by the vertices of an edge the jobs in which nothing was published on it."""
+        tables, load = self._tables, self._load
+        if not len(load.delay_base) or not any(tables.is_optional):
+            return {}
+        found = {}
+        for place, ((before, after), edge) in enumerate(edge_numbers(tables).items()):
+            if tables.is_optional[place]:
+                dag = tables.dag_of[before]
+                jobs = np.unique(load.jobs[load.dags == dag])
+                delays = load.delays[
+                    load.delay_base[dag] + jobs * load.delay_stride[dag] + edge]
+                silent = jobs[delays >= NEVER]
+                found[before, after] = self._numbers(np.full(len(silent), dag), silent)
+        return found

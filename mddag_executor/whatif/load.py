@@ -1,0 +1,561 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The load of a recorded run: releases, execution times, transport and dispatch times.
+
+Theory of operation
+-------------------
+* Jobs are the released jobs, in the order of release.  A source is ready when it was in the
+  recording: shortly after a timer's release, possibly long after the header stamp of a message.
+* A worker notices due timers before it chooses its next execution.  A timer that was noticed right
+  after the end of an execution, and was due before, is therefore known at its release: whenever
+  the next execution is chosen, it takes part.  Otherwise it is known when it was noticed.  One
+  worker notices nothing while it runs a callback, so whatever was due meanwhile is known.
+* The execution time of a vertex is the sum of the pieces of its execution.  If it did not complete
+  (dropped, expired, open at the end), it is the callback's median, otherwise the declared mean.
+* A job that expired at its release never ran: its timer was noticed after its next period.  This
+  depends on the machine, not on the scheduler, so the job is skipped again.
+* A sync vertex has the execution time of the leg that completed it.  Earlier legs, which only
+  store their message, load the workers like undeclared callbacks: each piece is a job of the
+  undeclared DAG, ready when it was in the recording.  Their callback groups are ignored.
+* If CPU times are recorded, the load has the CPU time and whether the GIL was held (as recorded or
+  declared).  An execution that computes without the GIL takes its CPU time: for the rest of the
+  time it waited for a CPU.  One that holds the GIL takes its duration without the time in which
+  another callback also held the GIL; with one worker, or in fewer processes than recorded, it
+  takes its CPU time.  (The difference: other threads of its process computed.)
+* *Transport* is the time from the end of the publishing execution until the successor is ready;
+  negative if it published early.
+* *Dispatch* is the time from when an execution could have started until it started (see
+  ``dispatches``).  It occupies the worker, so it is added to the execution time.
+* A time that is missing in a job is replaced by the median of the edge, or of all executions.
+* Missing publications are kept: if an execution completed without publishing on a topic that its
+  callback used in other jobs, and no execution followed in that job, the edge is not satisfied.
+  Vertices that need it have no execution time.
+
+Without overheads (``overheads=False``) transport and dispatch take no time, and timers are ready
+at their release, as in an ideal executor on the same machine.
+
+Within the engine a job's index is its position among the recorded jobs of its DAG; ``jobs`` has
+the recorded indices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from mddag_executor.analysis.spans import crowded, Spans
+from mddag_executor.analysis.usage import ran
+from mddag_executor.core import legs_of, NEVER, quantile, Tables
+from mddag_executor.recording import tables as recorded_tables
+from mddag_executor.recording.tables import Ints, Recording, sort_by
+from mddag_executor.simulate import Load
+from mddag_executor.simulate.deliveries import DELAY_NS
+from mddag_executor.simulate.load import edge_numbers, FAILS, RUNS, SKIPPED
+from mddag_executor.whatif.dispatches import dispatch_times
+from msg_graph import Dag
+from msg_graph.model import optional_edges, topological_order
+import numpy as np
+
+_UNKNOWN = -1
+_NOT_RECORDED = -2
+
+
+class RecordedLoad(NamedTuple):
+    """
+    A load made from a recording.
+
+    ``jobs`` has, by DAG, the recorded index of each job; ``demand`` the execution times of all
+    declared jobs, ns; ``estimated`` counts vertices of jobs without a recorded execution time,
+    ``executions`` counts all; ``unknown`` names callbacks without any known time. ``dispatches``
+    is the dispatch part of ``load.costs``; it is empty without overheads. ``dispatch_ns`` and
+    ``transport_ns`` are measured medians, None if nothing was measured.
+    """
+
+    load: Load
+    jobs: Sequence[Sequence[int]]
+    demand: int
+    executions: int
+    estimated: int
+    unknown: list[str]
+    dispatch_ns: int | None = None
+    transport_ns: int | None = None
+    dispatches: Any = ()
+
+
+_JOB, _VERTEX, _EDGE = range(3)
+_COLUMNS = {
+    'release': (_JOB, 'i8'), 'noticed': (_JOB, 'i8'), 'turn': (_JOB, 'i8'),
+    'busy': (_JOB, 'i1'),
+    'took': (_VERTEX, 'i8'), 'start': (_VERTEX, 'i8'), 'end': (_VERTEX, 'i8'),
+    'cpu': (_VERTEX, 'i8'), 'dispatch': (_VERTEX, 'i4'), 'held': (_VERTEX, 'i2'),
+    'arrived': (_EDGE, 'i8'), 'sent': (_EDGE, 'i1')}
+"""Columns by job, by job and vertex, or by job and edge; ns or unknown (``sent``: 1)."""
+
+
+class LoadBuilder:
+    """
+    Makes a load from a recording.
+
+    :param n_workers: number of workers of each recorded process.
+    :param processes: by vertex the recorded process, from 1; None: one process.
+    :param times: by DAG the execution times of its jobs and vertices, for a recording without
+        executions; None: missing ones are estimated.
+    """
+
+    def __init__(
+        self, recording: Recording, tables: Tables, n_workers: int,
+        processes: Sequence[int] | None = None, times: Sequence[Any] | None = None,
+    ) -> None:
+        task_set = recording.task_set
+        self._task_set, self._recording, self._tables = task_set, recording, tables
+        self._first = tables.first_vertex
+        #: Number of runs of undeclared callbacks in other processes than the first.
+        self.left_out = 0
+        self._process = [*(processes or [1] * tables.n_vertices), 1]
+        self._times = times
+        self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
+        # by global vertex and leg: the edge (number in its DAG) that its message satisfies
+        numbers = edge_numbers(tables)
+        self._edges_into = [
+            [numbers[first + before, first + vertex.index]
+             for _, before in legs_of(vertex, dag.vertices)]
+            for dag, first in zip(task_set.dags, tables.first_vertex) for vertex in dag.vertices]
+        # by DAG and edge: the vertex that publishes
+        self._publishers = [[v.index for v in dag.vertices for _ in v.successors]
+                            for dag in task_set.dags]
+        self._failed: set[tuple[int, int]] = set()
+        self._skipped: set[tuple[int, int]] = set()
+        jobs = recording.jobs
+        of_dag = [jobs.of_dag(dag.index) for dag in task_set.dags]
+        # by DAG: the recorded numbers of its jobs
+        self._numbers = [jobs.number[mine] for mine in of_dag]
+        # by kind of column and DAG: the values of each job, and where they begin
+        self._widths = np.array(
+            [(1, len(dag.vertices), len(edges)) for dag, edges in zip(
+                task_set.dags, self._publishers)], dtype=np.int64).reshape(-1, 3).T
+        counts = np.diff(jobs.first)
+        self._begins = np.cumsum(np.pad(self._widths * counts, ((0, 0), (1, 0))), axis=1)
+        # by kind of column and vertex: its place in the first job, and the step to the next job
+        dag_of = np.array(tables.dag_of[:tables.n_vertices], dtype=np.int64)
+        self._base, self._step = self._begins[:, dag_of], self._widths[:, dag_of]
+        self._base[_VERTEX] += np.array(tables.index_in_dag[:tables.n_vertices], dtype=np.int64)
+        self._columns: dict[str, Any] = {
+            name: np.full(self._begins[by, -1], _UNKNOWN, dtype=kind)
+            for name, (by, kind) in _COLUMNS.items()}
+        for dag, mine in enumerate(of_dag):
+            release, noticed = self._of(dag, 'release', 'noticed')
+            release[:] = jobs.release[mine]
+            noticed[:] = np.maximum(jobs.release[mine], jobs.noticed[mine])
+        self._note_ends()
+        self._executions = table = recording.executions
+        #: By execution the row of its job.
+        places = recording.job_places
+        self._row = np.where(places >= 0, places - jobs.first[table['dag']], _UNKNOWN)
+        self._note_pieces(n_workers)
+        self._note_completions()
+        self._note_publications()
+        del self._row, self._executions
+
+    def _of(self, dag: int, *names: str) -> list[Any]:
+        """Return the columns of a DAG as views; those of vertices and edges have a row a job."""
+        found = []
+        for name in names:
+            by, _ = _COLUMNS[name]
+            begin, end = self._begins[by, dag:dag + 2]
+            shape = len(self._numbers[dag]), self._widths[by, dag]
+            found.append(self._columns[name][begin:end].reshape(shape[:1 + (by != _JOB)]))
+        return found
+
+    def _places(self, by: int, row: Any, vertex: Any) -> Ints:
+        """Return the places of vertices of jobs in a kind of column (``_EDGE``: of edge 0)."""
+        place: Ints = self._base[by][vertex] + row * self._step[by][vertex]
+        return place
+
+    def _note_ends(self) -> None:
+        """Keep failed and skipped executions: they fail or are skipped again."""
+        ends = self._recording.job_ends
+        for dag in range(len(self._numbers)):
+            mine = ends[ends['dag'] == dag]
+            row = self._recording.jobs.rows_of(dag, mine['job'])
+            failed = (row >= 0) & (mine['reason'] == recorded_tables.FAILED)
+            self._failed |= set(zip(mine['vertex'][failed].tolist(), row[failed].tolist()))
+            skipped = (row >= 0) & (mine['reason'] == recorded_tables.EXPIRED)
+            noticed, = self._of(dag, 'noticed')
+            skipped[skipped] = noticed[row[skipped]] == mine['time'][skipped]
+            self._skipped |= {(dag, each) for each in row[skipped].tolist()}
+
+    def _note_pieces(self, n_workers: int) -> None:
+        """Find the dispatch times of pieces; keep undeclared pieces."""
+        table = self._executions
+        rows = ran(table)
+        if self._recording.imported:    # others have interpreters and threads of their own
+            process = self._recording.executions['process'][rows]
+            other = (table['vertex'][rows] < 0) & (process > 0)
+            self.left_out = int((other & (process < len(self._recording.placed))).sum())
+            rows = rows[~other]
+        vertex, piece, ready, start, end, worker, holds, cpu, completes = (
+            table[name][rows] for name in (
+                'vertex', 'piece', 'ready', 'start', 'end', 'worker', 'holds_gil', 'cpu',
+                'completes'))
+        row, first = self._row[rows], piece == 0
+        process = np.array(self._process, dtype=np.int16)[vertex]
+        members = [(number, np.flatnonzero(process == number))
+                   for number in sorted(set(self._process))]
+        for number, mine in members:
+            self._find_turns(number, start[mine], end[mine])
+        ready[~first] = start[~first]
+        others = np.flatnonzero(vertex < 0)
+        # ready, duration, dispatch or -1: undeclared callbacks, and legs that completed nothing
+        self._others = [np.column_stack((ready[others], (end - start)[others], others))]
+        source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
+        turn = self._columns['turn'][self._places(_JOB, row[source], vertex[source])]
+        known = first[source] & (turn >= 0)
+        ready[source[known]] = turn[known]
+        self._late = dispatch_times(
+            n_workers, worker, self._groups(rows, vertex), ready, start, end,
+            [mine for _, mine in members],
+            holds & (cpu >= 0) & (completes == recorded_tables.VERTEX))
+        ran_as = np.full(self._tables.n_vertices + 1, _UNKNOWN)
+        ran_as[vertex[::-1]] = rows[::-1]     # the first one is written last
+        callback = self._recording.executions['callback']
+        #: By global vertex: the address of the callback that ran as it.
+        self.callback_of: dict[int, int] = {
+            v: int(callback[at]) for v, at in enumerate(ran_as[:-1].tolist()) if at >= 0}
+        mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
+        self._columns['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
+
+    def _find_turns(self, process: int, start: Ints, end: Ints) -> None:
+        """
+        Find the timers that were noticed right after the end of an execution: ``turn``.
+
+        ``busy`` says whether any execution ran at the release.
+
+        :param start: of the executions of a process; ``end``: likewise, ascending.
+        """
+        start = np.append(np.sort(start), NEVER)
+        for dag, source in enumerate(self._tables.source[:-1]):
+            if not self._timer[dag] or self._process[source] != process or not len(end):
+                continue
+            release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
+            ended = end[np.maximum(0, np.searchsorted(end, noticed, 'right') - 1)]
+            known = (ended >= release) & (ended <= noticed) & (
+                start[np.searchsorted(start, ended)] >= noticed)
+            turn[known] = ended[known]
+            busy[:] = np.searchsorted(start, release, 'right') > np.searchsorted(
+                end, release, 'right')
+
+    def _groups(self, rows: Ints, vertex: Ints) -> Ints:
+        """Return numbers of the mutually exclusive groups of executions, or -1."""
+        known = self._recording.who.groups
+        callbacks, which = self._recording.callbacks()
+        group_of = [known.get(each, _NOT_RECORDED) for each in callbacks.tolist()]
+        # small numbers, which are sorted fast: recorded groups, then declared ones
+        numbers = {each: n for n, each in enumerate({g for g in group_of if g >= 0})}
+        group = np.array([numbers.get(each, each) for each in group_of], dtype=np.min_scalar_type(
+            -2 - len(numbers) - self._tables.n_groups))[which[rows]]
+        unknown = np.flatnonzero(group == _NOT_RECORDED)
+        declared = np.array([*self._tables.group[:self._tables.n_vertices], -1])[vertex[unknown]]
+        group[unknown] = np.where(declared >= 0, len(numbers) + declared, -1)
+        return group
+
+    def _note_completions(self) -> None:
+        """Note the execution times of executions that completed a vertex."""
+        table, columns = self._executions, self._columns
+        rows = np.flatnonzero(
+            (table['completes'] != recorded_tables.NOTHING) & (table['vertex'] >= 0)
+            & (self._row >= 0) & (table['start'] >= 0))
+        rows = rows[sort_by(table['order'][rows])]
+        row, vertex, ready, leg, completes = self._row[rows], *(
+            table[name][rows] for name in ('vertex', 'ready', 'leg', 'completes'))
+        n_legs = np.array([max(1, len(each)) for each in self._edges_into])
+        width = int(n_legs.max(initial=1))
+        edges = np.array([[*each, *[-1] * (width - len(each))] for each in self._edges_into]
+                         or [[-1]])
+        ended = completes == recorded_tables.VERTEX
+        every_leg = ended & (leg == recorded_tables.ALL_LEGS) & (n_legs[vertex] > 1)
+        leg = np.where(leg < 0, n_legs[vertex] - 1, leg)
+        edge = np.where(leg < width, edges[vertex, np.minimum(leg, width - 1)], -1)
+        known = edge >= 0
+        columns['arrived'][self._places(_EDGE, row[known], vertex[known]) + edge[known]] = ready[
+            known]
+        self._others.append(np.column_stack((
+            ready[~ended], table['busy'][rows[~ended]], np.full(int((~ended).sum()), _UNKNOWN))))
+        place, done = self._places(_VERTEX, row[ended], vertex[ended]), rows[ended]
+        for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
+                             ('start', 'began'), ('end', 'end')):
+            columns[name][place] = table[column][done]
+        source = ended & ~known
+        place = self._places(_JOB, row[source], vertex[source])
+        columns['noticed'][place] = np.maximum(ready[source], columns['release'][place])
+        for v in np.unique(vertex[every_leg]).tolist():
+            self._split_legs(self._tables.dag_of[v], row[every_leg & (vertex == v)],
+                             self._edges_into[v])
+
+    def _split_legs(self, dag: int, rows: Ints, edges: list[int]) -> None:
+        """If one execution completed all legs, only the last message's time is known."""
+        end, arrived = self._of(dag, 'end', 'arrived')
+        ends = end[rows][:, [self._publishers[dag][edge] for edge in edges]]
+        for edge, published in zip(edges, ends.T):
+            early = published < ends.max(axis=1)
+            arrived[rows[early], edge] = published[early]
+
+    def _note_publications(self) -> None:
+        """
+        Note which edges the publications of jobs satisfied.
+
+        A sync may have several topics of one publisher, so its edge needs several messages.  Those
+        that are published each time need not be checked if others are published only sometimes.
+        """
+        edges_from: dict[tuple[int, str | None], list[tuple[int, int]]] = {}
+        needed: dict[tuple[int, int], int] = {}
+        for dag, first in zip(self._task_set.dags, self._first):
+            for vertex in dag.vertices:
+                optional = {
+                    (before, topic): place for before in vertex.predecessors
+                    for place, (after, topic) in enumerate(optional_edges(
+                        dag.vertices[before], dag.vertices)) if after == vertex.index}
+                several = {before for before, _ in optional}
+                for (place, before), edge in zip(
+                        legs_of(vertex, dag.vertices), self._edges_into[first + vertex.index]):
+                    topic = vertex.callback.topics[place]
+                    bit = 1 << min(7, optional.get((before, topic), 0))
+                    if before not in several or (before, topic) in optional:
+                        edges_from.setdefault((first + before, topic), []).append((edge, bit))
+                        needed[dag.index, edge] = needed.get((dag.index, edge), 0) | bit
+        table, sent = self._executions, self._recording.publications
+        by = sent['execution']
+        by, publisher = by[by >= 0], sent['publisher'][by >= 0]
+        row, vertex_of = self._row[by], table['vertex'][by]
+        known = (row >= 0) & (vertex_of >= 0)
+        row, vertex_of, publisher = row[known], vertex_of[known], publisher[known]
+        publishers = self._recording.who.every_publisher
+        found = np.zeros(len(self._columns['sent']), dtype=np.uint8)
+        for number in np.unique(publisher).tolist():
+            name = publishers[number].topic if number in publishers else None
+            mine = publisher == number
+            for v in np.unique(vertex_of[mine]).tolist():
+                places = self._places(_EDGE, row[mine & (vertex_of == v)], v)
+                for edge, bit in edges_from.get((v, name), ()):
+                    found[places + edge] |= bit
+        for (dag_index, edge), bits in needed.items():
+            begin, end = self._begins[_EDGE, dag_index:dag_index + 2]
+            step = int(self._widths[_EDGE, dag_index])
+            sent = self._columns['sent'][begin:end][edge::step]
+            sent[found[begin:end][edge::step] == bits] = 1
+
+    def times(self) -> list[list[int]]:
+        """Return by DAG and vertex the execution time, 0 if unknown."""
+        typical = self._typical()
+        return [[typical.get(vertex.callback.key, 0) for vertex in dag.vertices]
+                for dag in self._task_set.dags]
+
+    def build(
+        self, overheads: bool = True, process: Sequence[int] | None = None, workers: int = NEVER,
+    ) -> RecordedLoad:
+        """
+        Return the load.
+
+        :param process: by vertex the process to run it in; None: as recorded.
+        :param workers: workers of each process, if fewer than in the recording.
+        """
+        process = process or self._process
+        every, usual, late = self._dispatches()
+        self._subtract_others(workers == 1 or max(process) < max(self._process))
+        unsent = self._unsent()
+        delays, transport = self._transports(overheads, process)
+        if unsent:
+            delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
+        for name in ('start', 'end', 'arrived', 'sent'):    # they are large for long runs
+            del self._columns[name]
+        estimated, unknown = self._estimate(process, unsent)
+        took, cpu, held = (self._columns[name] for name in ('took', 'cpu', 'held'))
+        demand, executions = int(took.sum()), len(took)
+        if overheads:
+            took += late
+        others = np.concatenate(self._others)
+        others = others[sort_by(*others.T)]
+        more = np.zeros(len(others), dtype=np.int64)
+        number = others[:, 2]
+        costs = np.concatenate([took, np.maximum(0, others[:, 1]) + np.where(
+            (number >= 0) & overheads, every[number], 0)])
+        columns: dict[str, Any] = {
+            'holds': np.concatenate([held, more]) if held.any() else []}
+        if len(self._recording.executions):
+            columns |= {
+                'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
+                'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
+                'delay_base': self._begins[_EDGE, :-1].tolist()}
+        load = self._load(costs, others[:, 0], overheads, workers == 1)
+        return RecordedLoad(
+            load._replace(fates=self._fates(len(costs)), **columns),
+            [jobs.tolist() for jobs in self._numbers], demand, executions, estimated, unknown,
+            usual, transport, late if overheads else late[:0])
+
+    def _unsent(self) -> list[Any]:
+        """Return by DAG, job and edge whether the edge was not published, as far as known."""
+        found = []
+        for dag, publishers in enumerate(self._publishers):
+            sent, arrived, end = self._of(dag, 'sent', 'arrived', 'end')
+            completed = end[:, publishers] >= 0
+            first = self._tables.first_successor[self._first[dag]]
+            optional = np.array(self._tables.is_optional[first:first + len(publishers)], dtype='?')
+            known = (sent >= 0).any(axis=0) | optional & (len(self._recording.publications) > 0)
+            found.append((sent < 0) & ((arrived < 0) | optional) & completed & known)
+        return found
+
+    def _never_ready(self, dag: Dag, unsent: Any) -> Any:
+        """Return by job and vertex whether it cannot run, because an earlier edge is unsent."""
+        first = self._first[dag.index]
+        found = np.zeros((len(unsent), len(dag.vertices)), dtype=np.bool_)
+        if unsent.any():
+            for v in topological_order(dag):
+                edges = self._edges_into[first + v]
+                found[:, v] = unsent[:, edges].any(axis=1) | found[
+                    :, list(dag.vertices[v].predecessors)].any(axis=1)
+        return found
+
+    def _estimate(self, process: Sequence[int], unsent: list[Any]) -> tuple[int, list[str]]:
+        """
+        Fill in execution and CPU times that were not recorded.
+
+        :param unsent: by DAG, job and edge whether the edge is not satisfied.
+        :return: their number, and the callbacks without any known time.
+        """
+        typical = self._typical()
+        unknown: dict[str, None] = {}
+        estimated = 0
+        for dag, edges in zip(self._task_set.dags, unsent):
+            took, cpu, held = self._of(dag.index, 'took', 'cpu', 'held')
+            took[[row for of, row in self._skipped if of == dag.index]] = 0
+            took[(took < 0) & self._never_ready(dag, edges)] = 0
+            if self._times is not None:
+                took[took < 0] = self._times[dag.index].reshape(took.shape)[took < 0]
+            missing = took < 0
+            estimated += int(missing.sum())
+            held[held < 0] = 0
+            for vertex in dag.vertices:
+                v, key = vertex.index, vertex.callback.key
+                if missing[:, v].any():
+                    if key not in typical:
+                        unknown[key] = None
+                    took[missing[:, v], v] = typical.get(key, 0)
+                known = cpu[:, v] >= 0
+                if known.any():     # executions that did not complete are like the others
+                    share = cpu[known, v].sum() / max(1, took[known, v].sum())
+                    cpu[missing[:, v], v] = took[missing[:, v], v] * min(1.0, share)
+                    held[missing[:, v], v] = held[known, v].mean() >= 0.5
+                if vertex.callback.holds_interpreter is not None:
+                    held[:, v] = vertex.callback.holds_interpreter
+                    if vertex.callback.holds_interpreter:
+                        cpu[~known, v] = took[~known, v]
+                held[:, v] *= process[self._first[dag.index] + v]
+        return estimated, list(unknown)
+
+    def _fates(self, executions: int) -> list[int]:
+        """Return which executions failed or were skipped; empty: none."""
+        fates = [RUNS] * executions if self._failed or self._skipped else []
+        for vertex, row in self._failed:
+            fates[int(self._places(_VERTEX, row, vertex))] = FAILS
+        for dag, row in self._skipped:
+            fates[int(self._places(_VERTEX, row, self._tables.source[dag]))] = SKIPPED
+        return fates
+
+    def _dispatches(self) -> tuple[Any, int | None, Any]:
+        """Return dispatch times by number (the last: the median), the median, and by execution."""
+        number = self._columns.pop('dispatch')
+        known = number[number >= 0]
+        usual = quantile(memoryview(np.sort(self._late[known])), 0.5) if len(known) else None
+        every = np.append(self._late, usual or 0)     # number -1
+        return every, usual, every[number]
+
+    def _subtract_others(self, alone: bool) -> None:
+        """
+        Subtract from durations the time in which others computed, down to the CPU time.
+
+        :param alone: whether executions that hold the GIL take their CPU time.
+        """
+        took, cpu, held, start, end = (
+            self._columns[name] for name in ('took', 'cpu', 'held', 'start', 'end'))
+        known = cpu >= 0
+        computes = known & np.where(held > 0, alone, 2 * cpu >= took)
+        np.minimum(took, cpu, out=took, where=computes)
+        holds = np.flatnonzero(known & (held > 0))
+        process = np.concatenate([np.empty(0, dtype=np.int64), *(
+            np.tile(self._process[first:after], len(jobs))
+            for first, after, jobs in zip(self._first, self._first[1:], self._numbers))])[holds]
+        for number in np.unique(process).tolist():
+            mine = holds[process == number]
+            shared = Spans(*crowded(start[mine], end[mine], 2)).within(start[mine], end[mine])
+            took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)
+
+    def _load(self, costs: Any, others: Ints, overheads: bool, one_worker: bool) -> Load:
+        # ready, DAG, row of the job in its DAG, release
+        n_dags = len(self._numbers)
+        parts = [np.column_stack((
+            others, np.full(len(others), n_dags), np.arange(len(others)), others))]
+        for dag in range(n_dags):
+            release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
+            ready = release if self._timer[dag] and not overheads else np.where(
+                (turn >= 0) | one_worker & (busy > 0), release, noticed)
+            parts.append(np.column_stack((
+                ready, np.full(len(ready), dag), np.arange(len(ready)), release)))
+        columns = np.concatenate(parts).T
+        ready, dags, rows, release = columns[:, np.lexsort(columns[::-1])]
+        return Load(ready, dags, rows, costs, self._begins[_VERTEX].tolist(),
+                    [*self._widths[_VERTEX].tolist(), 1], release)
+
+    def _transports(self, overheads: bool, process: Sequence[int]) -> tuple[Any, int | None]:
+        """
+        Return the transports by job, and the median of all measured ones.
+
+        An edge that newly crosses processes, or no longer does, gets the usual time of such edges.
+        """
+        delays: list[Any] = []
+        measured: dict[bool, list[Any]] = {False: [np.zeros(0)], True: [np.zeros(0)]}
+        changed: list[tuple[Any, bool]] = []
+        for dag, crosses in enumerate(self._crossings(process)):
+            start, end, arrived = self._of(dag, 'start', 'end', 'arrived')
+            ended = end[:, self._publishers[dag]]
+            found = arrived - ended
+            known = (arrived >= start[:, self._publishers[dag]]) & (ended >= 0)
+            for edge, (before, after) in enumerate(crosses):
+                column = found[known[:, edge], edge]
+                found[~known[:, edge], edge] = np.median(column) if len(column) else 0
+                measured[before].append(column)
+                if before != after:
+                    changed.append((found[:, edge], after))
+            delays.append(found)
+        usual = {after: np.concatenate(each) for after, each in measured.items()}
+        for view, after in changed:
+            times = usual[after]
+            view[:] = np.median(times) if len(times) else DELAY_NS * after
+        flat = np.concatenate([each.ravel() for each in delays] or [np.zeros(0, dtype=np.int64)])
+        everything = np.concatenate(list(usual.values()))
+        return (flat if overheads else np.zeros_like(flat),
+                int(np.median(everything)) if len(everything) else None)
+
+    def _crossings(self, process: Sequence[int]) -> list[list[tuple[bool, bool]]]:
+        """Return by DAG and edge whether it crossed processes, and whether it will."""
+        found: list[list[tuple[bool, bool]]] = [[] for _ in self._numbers]
+        was = self._process
+        for a, b in edge_numbers(self._tables):
+            found[self._tables.dag_of[a]].append((was[a] != was[b], process[a] != process[b]))
+        return found
+
+    def _typical(self) -> dict[str, int]:
+        """Return by callback the median of its recorded times, otherwise the declared mean."""
+        recorded: dict[str, list[Any]] = {}
+        for dag in self._task_set.dags:
+            took, = self._of(dag.index, 'took')
+            for vertex in dag.vertices:
+                recorded.setdefault(vertex.callback.key, []).append(took[:, vertex.index])
+        typical = {
+            c.key: c.execution_time.mean_ns
+            for c in self._task_set.callbacks if c.execution_time is not None}
+        for key, parts in recorded.items():
+            times = np.sort(np.concatenate(parts))
+            times = times[times >= 0]
+            if len(times):
+                typical[key] = quantile(memoryview(times), 0.5)
+        return typical

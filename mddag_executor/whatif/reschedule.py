@@ -1,0 +1,312 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Replay rescheduled: the recorded load, scheduled again by the core.
+
+The recorded load (see ``load``) is scheduled in virtual time.  Recorded ends of jobs don't matter,
+only their releases, execution times, and the executor's times for noticing, dispatch and
+transport.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from functools import cached_property, partial
+from typing import Any
+
+from mddag_executor.analysis.as_recorded import recording_result, Replay
+from mddag_executor.analysis.usage import share
+from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, Tables, Tally
+from mddag_executor.core import policy as find_policy
+from mddag_executor.core.tables import DEMOTE, ON_LATE
+from mddag_executor.errors import UsageError
+from mddag_executor.memory import give_back
+from mddag_executor.recording.head import Head, ReplayError
+from mddag_executor.recording.tables import Recording, UNKNOWN
+from mddag_executor.simulate import LogEntry, schedule, Settings
+from mddag_executor.simulate.load import SKIPPED
+from mddag_executor.simulate.workload import with_execution_times
+from mddag_executor.sources.open import Given, open_recording, Progress, undeclared
+from mddag_executor.text import counted, listed
+from mddag_executor.whatif.computed import ComputedRun
+from mddag_executor.whatif.load import LoadBuilder, RecordedLoad
+from msg_graph import NO_GRAPH, Process, TaskSet
+from msg_graph.derive import no_garbage
+from msg_graph.model import MOST_WORKERS
+
+
+class Reschedule:
+    """
+    The schedule of a recorded load.
+
+    :param run: the recording; ``work``: its load.
+    :param recorded: the replay as recorded; None: it was a bag.
+    :ivar processes: nodes of each process; empty: one process.
+    :ivar workers: of all processes.
+    :ivar decisions: decisions of the core; ``busy``: by worker its busy time, ns.
+    :ivar warnings: missing or doubtful data, one line each.
+    """
+
+    def __init__(
+        self, run: Recording, work: RecordedLoad, tables: Tables, settings: Settings,
+        warnings: list[str], skip: int, overheads: bool, processes: Sequence[Process],
+        recorded: Replay | None,
+    ) -> None:
+        self.task_set, self._run, self.notes = run.task_set, run, run.notes
+        self.work, self.tables, self.settings = work, tables, settings
+        self.recorded, self.processes, self.warnings = recorded, processes, warnings
+        self.workers = settings.workers * settings.processes
+        self._skip, self._overheads = skip, overheads
+        self.tally = Tally(run.task_set, tables)
+        result = schedule(tables, work.load, settings)
+        self.decisions, self.busy = result.decisions, result.busy
+        result.count_into(self.tally, work.load, settings)
+
+    @cached_property
+    def log(self) -> Sequence[LogEntry]:
+        """Return starts, ends and preemptions, on the recording's clock; runs the load again."""
+        return schedule(self.tables, self.work.load, self.settings, log=True).log
+
+    @property
+    def worker_names(self) -> list[str]:
+        """Return the names of workers, if they are more than a number."""
+        return [f'{process.name} {w}' for process in self.processes
+                for w in range(self.settings.workers)]
+
+    @property
+    def _requires(self) -> bool:
+        return any(path.requirements for path in self.task_set.paths)
+
+    @property
+    def duration_ns(self) -> int:
+        """Return the duration of the recording."""
+        return max(0, self.settings.duration_ns - self._run.begin)
+
+    @property
+    def _scheduled_ns(self) -> int:
+        """Return how long callbacks are scheduled: a part also has jobs of before its begin."""
+        begin = self._run.begin
+        return self.settings.duration_ns - min([begin, *self.work.load.times[:1]])
+
+    def computed(self) -> ComputedRun:
+        """Return the schedule as a computed run."""
+        end = self.settings.duration_ns
+        return ComputedRun(
+            self.task_set, self.work.load, self.log, self.decisions, end, end, True,
+            self.work.jobs, self.settings.judge_from, self._run.judged_releases)
+
+    def result(self) -> dict[str, Any]:
+        """Return the result format of ``replay --json``, including the recorded run."""
+        duration, settings, work = self.duration_ns, self.settings, self.work
+        verdicts = self.tally.result()
+        skipped = work.load.fates.count(SKIPPED)
+        miss = verdicts['first_miss']
+        if miss is not None:
+            dag = self.task_set.dag(miss['dag']).index
+            miss = {**miss, 'job': work.jobs[dag][miss['job']]}
+        paths = self.computed().requirements() if self._requires else {}
+        return {
+            'policy': settings.policy, 'on_late': settings.on_late, 'workers': self.workers,
+            'preemptive': settings.preemptive,
+            **({} if settings.cpus is None else {'cpus': settings.cpus}),
+            'duration_ns': duration,
+            **({'processes': [asdict(each) for each in self.processes]}
+               if self.processes else {}),
+            'utilisation': share(work.demand, self.workers, self._scheduled_ns),
+            **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self._skip,
+            'executions': work.executions, 'estimated_executions': work.estimated,
+            **({'skipped_jobs': skipped} if skipped else {}),
+            'overheads': {
+                'included': self._overheads, 'added_ns': settings.dispatch_overhead_ns,
+                'dispatch_median_ns': work.dispatch_ns,
+                'transport_median_ns': work.transport_ns},
+            'worker_use': {
+                'busy_ns': {str(w): took for w, took in enumerate(self.busy)},
+                'use': share(sum(self.busy), self.workers, self._scheduled_ns)},
+            'recorded': None if self.recorded is None else {
+                'policy': self.recorded.recording.head.policy,
+                'workers': self.recorded.recording.head.workers,
+                **self.recorded.tally.result(),
+                **({'requirements': self.recorded.requirements.result()} if paths else {})},
+            **paths, 'recording': recording_result(self._run),
+            **({'notes': self.notes} if self.notes else {}),
+            'warnings': self.warnings}
+
+
+def reschedule(
+    path: Given | Recording,
+    task_set: TaskSet | None = None,
+    *,
+    policy: str | None = None,
+    workers: int | None = None,
+    preemptive: bool | None = None,
+    on_late: str | None = None,
+    overheads: bool = True,
+    dispatch_overhead: int = 0,
+    name: str | None = None,
+    progress: Progress | None = None,
+    skip: int = 0,
+    cpus: int | None = None,
+    processes: Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None = None,
+    times: Sequence[Any] | None = None,
+) -> Reschedule:
+    """
+    Run the core with the releases and execution times of a trace.
+
+    :param path: a trace of this executor, or a recording.
+    :param task_set: the declaration to schedule by; None: the one in the trace.
+    :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
+    :param workers: size of the pool of each process; None: as recorded.
+    :param preemptive: whether a smaller key preempts a larger one; None: as recorded, if the
+        policy supports it.
+    :param on_late: handling of late jobs of a DAG that does not declare it; None: as recorded.
+    :param overheads: whether noticing, dispatch and transport take their recorded times, or none.
+    :param dispatch_overhead: added to each execution, ns.
+    :param name: the trace's name in messages, if not its path.
+    :param progress: called regularly with the number of events read.
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
+    :param cpus: shared by executions that compute; None: as recorded, enough for all if unknown.
+    :param processes: returns the nodes of each process, from the task set and the time of each
+        vertex; None: as recorded, or as in ``task_set``.
+    :param times: by DAG the execution times of its jobs and vertices, ns, for a recording without
+        executions.
+    :raises mddag_executor.trace.TraceError: if the file is not a trace.
+    :raises mddag_executor.ReplayError: if the trace has nothing to replay, none of the
+        declaration's callbacks, or an execution time that is neither recorded nor declared.
+    :raises mddag_executor.errors.MddagError: for an invalid policy or number of workers.
+    """
+    if policy is not None:
+        find_policy(policy).mode(bool(preemptive))
+    if workers is not None and not 1 <= workers <= MOST_WORKERS:
+        raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
+    run = path if isinstance(path, Recording) else open_recording(
+        path, task_set, name, progress)
+    if run.task_set is NO_GRAPH:
+        raise undeclared(run.name)
+    head, each, given = run.head, run.workers_each, policy
+    policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
+    cpus = cpus or head.cpus or None
+    if preemptive is None:
+        preemptive = head.preemptive and not find_policy(policy).polling
+    if on_late is None:     # any other number is damage
+        on_late = next((name for name, n in ON_LATE.items() if n == head.on_late), 'continue')
+    tables_of = partial(
+        Tables.build, default_deadline=head.default_deadline, on_late=on_late,
+        max_active_jobs=head.max_active_jobs if head.max_active_jobs > 0 else NEVER,
+        expire_after=EXPIRE_AFTER_NS)
+    tables = tables_of(run.task_set)
+    recorded = Replay(run, skip) if run.messages is None else None
+    with no_garbage():
+        builder = LoadBuilder(run, tables, each, _processes(run, run.placed), times)
+    give_back()
+    placed = _placed(run, builder) if processes is None else processes(
+        run.task_set, builder.times())
+    if len(placed) < 2:
+        placed = ()
+    if DEMOTE in tables.on_late:  # by measured times, as the executor does
+        tables = tables_of(with_execution_times(run.task_set, builder.times()))
+    tables = tables._replace(process=[*_processes(run, placed), 1])
+    notes = []
+    if given is None and len(placed) > 1 and find_policy(policy).polling:
+        notes.append(
+            f'{run.name}: rescheduled with policy fifo, because {policy} (polling) is known of '
+            'one process only: choose another with --policy')
+        policy = 'fifo'
+    find_policy(policy).mode(preemptive, len(placed))
+    with no_garbage():
+        work = builder.build(overheads, tables.process, workers if workers < each else NEVER)
+    if work.unknown:
+        raise ReplayError(
+            run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
+            f'and no execution_time is declared: {listed(work.unknown)}',
+            'give a GRAPH that declares it')
+    tables = with_groups(
+        tables, builder.callback_of, run.who.groups, declared_first=not run.same)
+    left_out = builder.left_out
+    del builder     # the load has copies of its data
+    give_back()
+    warnings, judge_from = run.warnings, run.begin + skip if skip else -NEVER
+    begin, judge_until = run.judged_releases or (-NEVER, NEVER)
+    if recorded is not None:
+        warnings, judge_from = recorded.warnings, recorded.judged.judge_from
+    warnings += notes
+    if left_out:
+        warnings.append(
+            f'{run.name}: {counted(left_out, "run")} of undeclared callbacks in processes of '
+            'declared ones take no time: declare them, as mddag graph from-trace does')
+    if cpus is not None and run.declared and len(work.load.computed) == 0:
+        warnings.append(
+            f'{run.name}: CPU times are not recorded in it, so with --cpus each '
+            'execution computes all the time')
+    waited = set(run.executions['vertex'][run.executions['piece'] > 0].tolist()) - {UNKNOWN}
+    if waited and not head.preemptive:
+        warnings.append(
+            f'{run.name}: the time in which coroutines waited is left out: '
+            + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
+    settings = Settings(
+        policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
+        judge_from=max(begin, judge_from), judge_until=judge_until,
+        processes=max(1, len(placed)), on_late=on_late)
+    with no_garbage():
+        return Reschedule(
+            run, work, tables, settings, warnings, skip, overheads, placed, recorded)
+
+
+def _processes(run: Recording, placed: Sequence[Process]) -> list[int]:
+    return processes_of(replace(run.task_set, processes=tuple(placed)))
+
+
+def _placed(run: Recording, builder: LoadBuilder) -> Sequence[Process]:
+    """
+    Return the processes of a recording, or of another declaration that judges it.
+
+    The trace of one of several processes only has the callbacks of that process.
+    """
+    declared = run.task_set.processes
+    if run.placed:
+        return declared or run.placed
+    vertices = run.task_set.vertices
+    ran = {run.task_set.process_of(vertices[v].callback.node) for v in builder.callback_of}
+    return declared if len(ran) == 1 or not run.same else ()
+
+
+def _settings(
+    head: Head, name: str, policy: str | None, workers: int | None
+) -> tuple[str, int]:
+    """Return policy and workers as requested, otherwise as recorded."""
+    if policy is None:
+        policy = head.policy
+        if policy not in POLICIES:
+            raise ReplayError(
+                name, f"it was recorded with policy '{policy}', which this version does not have",
+                f'give --policy, one of {", ".join(POLICIES)}')
+    if workers is None:
+        workers = head.workers
+        if not 1 <= workers <= MOST_WORKERS:
+            raise ReplayError(
+                name, f'it says that it was recorded with {counted(workers, "worker")}',
+                'give --workers')
+    return policy, workers
+
+
+def with_groups(
+    tables: Tables, callback_of: dict[int, int], groups: dict[int, int], declared_first: bool
+) -> Tables:
+    """
+    Return tables with the callback groups of the recording.
+
+    :param callback_of: by global vertex the callback that ran as it.
+    :param groups: by callback its group in the recording, -1 for a reentrant one.
+    :param declared_first: whether declared groups have priority over recorded ones.
+    """
+    numbers: dict[tuple[bool, int], int] = {}
+    column = []
+    for vertex, declared in enumerate(tables.group):
+        recorded = groups.get(callback_of.get(vertex, 0))
+        if recorded is None or (declared_first and declared >= 0):
+            choice = (False, declared)
+        else:
+            choice = (True, recorded)
+        column.append(-1 if choice[1] == -1 else numbers.setdefault(choice, len(numbers)))
+    return tables._replace(group=column, n_groups=len(numbers))

@@ -1,0 +1,179 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Systems from traces: who is who, what was measured, what drifted; on traces made here."""
+
+import re
+
+from mddag_executor import Replay, replay
+from mddag_executor.analysis.drafting import System
+from mddag_executor.errors import InputError
+from msg_graph import loads
+from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, LEFT_OUT, MARK
+import pytest
+
+from ..sources.helpers import MS, Written
+from ..sources.recorded import Recorded
+
+
+def service(r, number, node, name):
+    r.add('ros2:rcl_service_init', 0, 1, number, node, 0, name)
+    r.add('ros2:rclcpp_service_callback_added', 0, 1, number, number + 1)
+
+
+def ran(r, callback, thread, start, length, *publishers):
+    r.run(callback, thread, start, start + length)
+    for each in publishers:
+        r.add('ros2:rcl_publish', start + 1, thread, each, 0)
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """Give a trace of two timers, of which the second publishes, and of two subscriptions."""
+    r = Recorded(tmp_path / 'r.mcap')
+    for handle, name in ((200, '/b'), (100, '/a'), (300, '/ns/quiet')):     # in any order
+        r.node(handle, name)
+    for handle, node, topic in ((110, 100, '/x'), (111, 100, '/rosout'), (112, 100, '/unseen'),
+                                (310, 300, '/alone')):
+        r.publisher(handle, node, topic)
+    for callback in (130, 131):
+        r.timer(callback, 100, 10 * MS)
+    r.group(140, 'mutually_exclusive', ('timer', 130), ('timer', 131))
+    # rclcpp makes a subscription's links in another order than rclpy
+    r.add('ros2:rclcpp_subscription_callback_added', 0, 1, 220, 230)
+    r.add('ros2:rclcpp_subscription_init', 0, 1, 210, 220)
+    r.add('ros2:rcl_subscription_init', 0, 1, 210, 200, 0, '/x', 10)
+    for callback, topic in ((231, '/out'), (232, '/parameter_events')):
+        r.subscription(callback, 200, topic)
+    service(r, 250, 200, '/b/get_parameters')
+    service(r, 260, 200, '/serve')
+    for k in range(20):
+        at = 1_000 * MS + 10 * MS * k
+        ran(r, 130, 1, at, MS)
+        ran(r, 131, 2, at, 2 * MS + k, 110, 111)
+        ran(r, 230, 3, at + 3 * MS, MS)
+        ran(r, 231, 3, at // 2 + 4 * MS, MS)
+    r.add('ros2:callback_end', 5_000 * MS, 9, 131)     # cut: its start is not there
+    return r.write()
+
+
+def test_from_a_trace(recorded):
+    text = declaration_of(System(recorded).draft())
+    assert f'# From the trace {recorded}.' in text
+    accepted = re.sub(rf'^( +)# (\w+: .*# {MARK})', r'\1\2', text, flags=re.MULTILINE)
+    # That quiet node's publisher has no callback: a timer of unknown period is supposed.
+    accepted = accepted.replace('publishes: [/unseen]', 'publishes: []', 1).replace(
+        '        publishes: [/x]\n', '', 1)
+    task_set = loads(accepted)
+    assert [(c.key, c.kind, c.topics) for c in task_set.callbacks] == [
+        ('/a:callback_0', 'timer', ()), ('/a:callback_1', 'timer', ()),
+        ('/b:callback_0', 'subscription', ('/x',)), ('/b:callback_1', 'subscription', ('/out',)),
+        ('/ns/quiet:callback_0', 'timer', ())]
+    assert [line for line in text.splitlines() if line.startswith(LEFT_OUT)] == [
+        f'{LEFT_OUT} /b:callback_2 (service /serve): it never ran']
+    assert task_set.callbacks[0].group == task_set.callbacks[1].group == 'callback_group_0'
+    assert task_set.callbacks[1].publishes == ('/x', '/unseen')
+    assert task_set.callbacks[3].period_ns == 5 * MS
+    assert 'no callback here publishes the topic; the time between two messages; proposed' in text
+    time = task_set.callbacks[1].execution_time
+    assert time.quantiles_ns == (
+        2 * MS, 2 * MS + 9, 2 * MS + 17, 2 * MS + 19, 2 * MS + 19)
+    assert time.percent == (0, 50, 90, 99, 100)
+    assert 'get_parameters' not in text and 'parameter_events' not in text
+
+
+def test_subscriptions_that_may_be_a_sync_have_a_comment():
+    """One source leads to /left and /right, another one to /other."""
+    def node(name, *heard, **timers):
+        return DraftNode(name, {
+            **{topic: DraftCallback(name, topic, 'subscription', [f'/{topic}'])
+               for topic in heard},
+            **{timer: DraftCallback(name, timer, 'timer', period_ns=MS, publishes=topics)
+               for timer, topics in timers.items()}})
+
+    text = declaration_of(Draft('a test', [
+        node('/a', both=['/left', '/right'], other=['/other']),
+        node('/b', 'left', 'right', 'other'), node('/c', 'left', 'other')]))
+    assert [line for line in text.splitlines() if 'sync' in line] == [
+        '      # If these are one sync, declare one callback: sync: [/left, /right]']
+
+
+def test_names_periods_and_what_no_one_declares(tmp_path):
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(100, '/cam')
+    r.publisher(110, 100, '/cam/transition_event')
+    for n, period, symbol in (
+            (1, 33_333_333, 'robot.Cam.grab'), (2, 33_299_999, 'robot.make.<locals>.<lambda>'),
+            (3, 1_500, 'robot.Cam.grab'), (4, 20 * MS, 'std::_Bind<void (Node::*(Node*))()>')):
+        r.timer(n, 100, period)
+        r.add('ros2:rclcpp_callback_register', 0, 1, n, symbol)
+    for n, name in enumerate(('change_state', 'get_state', 'get_available_states',
+                              'get_available_transitions', 'get_transition_graph',
+                              'ask/get_state')):
+        service(r, 200 + 2 * n, 100, f'/cam/{name}')
+    r.node(300, '/a')       # nodes are sorted
+    r.timer(310, 300, 50 * MS)
+    ran(r, 1, 1, 1_000 * MS, MS, 110)
+    ran(r, 211, 1, 1_100 * MS, MS)       # of /cam/ask/get_state: the others never run
+    text = declaration_of(System(r.write()).draft())
+    assert re.findall(r'name: (.*)', text) == [
+        'callback_0', 'grab', 'callback_1', 'grab_2', 'callback_3', 'callback_4']
+    assert re.findall(r'timer: (.*)', text)[:5] == [
+        '50ms', '33.333ms', '33.3ms', '1.5us', '20ms']
+    assert re.findall(r'service: (.*)', text) == ['/cam/ask/get_state']
+    assert 'transition_event' not in text
+
+
+def test_what_is_no_system(tmp_path):
+    r = Recorded(tmp_path / 'e.mcap')
+    r.run(5, 1, 1, 2)
+    with pytest.raises(InputError, match='no timer, subscription or service of a node'):
+        System(r.write())
+
+
+def test_drift_of_an_imported_recording(recorded):
+    text = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: one, timer: 10ms, deadline: 5ms, dag: one}
+      - {name: two, timer: 10ms, publishes: [/x]}
+  - node: /b
+    callbacks:
+      - {name: x, subscription: /x, deadline: 5ms}
+      - {name: o, subscription: /out, period: 5ms, deadline: 5ms, dag: o}
+"""
+    assert replay(recorded, loads(text)).drift() == []
+    outcome = replay(recorded, loads(
+        text.replace(', publishes: [/x]', ', deadline: 1s')
+        .replace('/x, deadline', '/x, period: 15ms, deadline')
+        .replace('/out', '/gone').replace('two', 'zwei')))
+    assert '1 of the 4 callbacks' in outcome.warnings[0] and '/b:o' in outcome.warnings[0]
+    found = outcome.drift()
+    assert [(each.kind, each.callback) for each in found] == [
+        ('publishes', '/a:zwei'), ('rate', '/b:x'), ('never ran', '/b:o')]
+    assert (found[1].declared, found[1].observed) == (15 * MS, 10 * MS)
+
+
+def test_a_warm_up_does_not_count_for_rates(tmp_path):
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: tick, timer: 10ms, publishes: [/x]}
+      - {name: once, subscription: /once, period: 10ms, deadline: 5ms}
+  - {node: /b, callbacks: [{name: x, subscription: /x, deadline: 5ms}]}
+""")
+    trace.release(1, 0, 0)
+    trace.run(1, 0, 0, 0, 1)
+    start = 0
+    for job in range(60):
+        start += 50 if job < 20 else 10   # until 1 s it is slow
+        trace.release(0, job, start)
+        trace.run(0, 0, job, start, start + 1)
+        if job >= 20:
+            trace.run(0, 1, job, start + 1, start + 2)
+    recording = replay(trace.end(start + 10)).recording
+    assert [each.kind for each in Replay(recording).drift()] == ['rate']
+    assert Replay(recording, skip=1_000 * MS).drift() == []
