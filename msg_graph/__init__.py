@@ -15,8 +15,8 @@ from msg_graph.errors import GraphError
 from msg_graph.model import (
     Callback,
     Dag,
+    EMPTY_TASK_SET,
     ExecutionTime,
-    NO_GRAPH,
     Path,
     Process,
     QueueEdge,
@@ -26,7 +26,7 @@ from msg_graph.model import (
 )
 
 __all__ = [
-    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'NO_GRAPH',
+    'Callback', 'Dag', 'DurationError', 'ExecutionTime', 'GraphError', 'EMPTY_TASK_SET',
     'Path', 'Process', 'QueueEdge', 'TaskSet', 'Vertex', 'WeaklyHard', 'format_duration', 'load',
     'loads', 'parse_duration',
 ]

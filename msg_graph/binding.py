@@ -26,7 +26,7 @@ import re
 from typing import NamedTuple
 
 from msg_graph.duration import format_duration
-from msg_graph.errors import shown
+from msg_graph.errors import quoted
 from msg_graph.model import Callback, TaskSet
 
 # A timer made from a float of seconds has a rounding error (rclpy cuts off fractions of a ns), and
@@ -69,7 +69,7 @@ class Binder:
 
     def __init__(self, task_set: TaskSet) -> None:
         self._callbacks = task_set.callbacks
-        self._place = task_set.places()
+        self._place = task_set.callback_indices()
         self._free: dict[Entity, list[int]] = {}
         self._timers: dict[str, set[Entity]] = {}
         self._bound: set[tuple[int, Entity]] = set()
@@ -143,11 +143,11 @@ def suggest_entity(callback: Callback, undeclared: Collection[Entity]) -> str | 
                          key=lambda ns: abs(ns - (wanted.period_ns or 0)))
             return f'did you mean its timer of {format_duration(period)}?'
         if found := _closest(wanted.start, (other.start for other in here)):
-            return f'did you mean the {_WORDS[wanted.kind]} {shown(found)}?'
+            return f'did you mean the {_WORDS[wanted.kind]} {quoted(found)}?'
         if found := _closest(wanted.node, (
                 other.node for other in alike if _same_below(other.start, wanted.start)
                 and is_period(other.period_ns or 0, wanted.period_ns or 0))):
-            return f'did you mean the node {shown(found)}?'
+            return f'did you mean the node {quoted(found)}?'
     return None
 
 

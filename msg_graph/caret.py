@@ -28,7 +28,7 @@ from typing import Any
 
 from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath
 from msg_graph.duration import DAY, MICROSECOND
-from msg_graph.errors import GraphError, shown, ValueProblem
+from msg_graph.errors import GraphError, quoted, ValueProblem
 from msg_graph.language import CALLBACK, GROUP, NODE, SERVICE, TOPIC
 from msg_graph.yamltext import parse_yaml, plain
 
@@ -65,7 +65,7 @@ def _node(tree: Plain) -> DraftNode:
         callback = _callback(each, node.name)
         if each['callback_name'] in node.callbacks:
             raise ValueProblem(
-                f"two callbacks of {node.name} are called {shown(each['callback_name'])}",
+                f"two callbacks of {node.name} are called {quoted(each['callback_name'])}",
                 'give each callback of a node its own name')
         node.callbacks[each['callback_name']] = callback
     for each in tree.get('callback_groups') or ():
@@ -93,14 +93,14 @@ def _callback(tree: Plain, node: str) -> DraftCallback:
     if kind == 'timer':
         period = tree['period_ns']
         if not (period.isdecimal() and MICROSECOND <= int(period[:19]) <= DAY):
-            raise ValueProblem(f"'period_ns' of {shown(full)} is {shown(period)}",
+            raise ValueProblem(f"'period_ns' of {quoted(full)} is {quoted(period)}",
                                f'write ns, from {MICROSECOND} to {DAY}')
         return DraftCallback(node, name, kind, period_ns=int(period))
     if kind == 'subscription':
         return DraftCallback(node, name, kind, [TOPIC.check(tree['topic_name'])])
     if kind == 'service':
         return DraftCallback(node, name, kind, [SERVICE.check(tree['service_name'])])
-    raise ValueProblem(f'the type {shown(kind)} of {shown(full)} is not known',
+    raise ValueProblem(f'the type {quoted(kind)} of {quoted(full)} is not known',
                        'use timer_callback, subscription_callback or service_callback')
 
 

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from itertools import chain
 
 from msg_graph.duration import format_duration
-from msg_graph.errors import Collector, did_you_mean, for_each, listed, shown
+from msg_graph.errors import Collector, did_you_mean, for_each, listed, quoted
 from msg_graph.include import as_text, read, resolve
 from msg_graph.language import (
     CALLBACK_KEYS,
@@ -48,12 +48,12 @@ def parse_declaration(
         text = as_text(resolved)
     top = Entry(resolved, 'the declaration', FILE)
     entries: dict[str, Entry] = {}
-    found = Collector()
-    workers = found(top.get, 'workers')
+    errors = Collector()
+    workers = errors.attempt(top.get, 'workers')
     concurrent: list[str] = []
-    callbacks = found(_callbacks, top, file, entries, concurrent)
-    paths = found(_paths, top, entries)
-    found.check()
+    callbacks = errors.attempt(_callbacks, top, file, entries, concurrent)
+    paths = errors.attempt(_paths, top, entries)
+    errors.check()
     processes = read_processes(top, (callback.node for callback in callbacks))
     return TaskSet((), tuple(callbacks), (), tuple(paths), workers, file, text, processes,
                    tuple(concurrent)), entries
@@ -69,24 +69,24 @@ def read_processes(top: Entry, nodes: Iterable[str]) -> tuple[Process, ...]:
         other = process_of.setdefault(node, process)
         if node not in nodes:
             raise declared.error(
-                process, f'there is no node {shown(node)}',
+                process, f'there is no node {quoted(node)}',
                 did_you_mean(node, nodes, 'name a node of the declaration'), item=node)
         if other != process:
             raise declared.error(
-                process, f'node {shown(node)} is also in process {shown(other)}',
+                process, f'node {quoted(node)} is also in process {quoted(other)}',
                 'remove one of them: a node runs in one process', item=node)
 
-    found = Collector()
+    errors = Collector()
     for process in declared:
-        for node in found(declared.get, process) or ():
-            found(place, process, node)
-    found.check()
+        for node in errors.attempt(declared.get, process) or ():
+            errors.attempt(place, process, node)
+    errors.check()
     processes: list[Process] = []
     for process in declared:
         rest = process if not processes else None
         here = tuple(node for node in nodes if process_of.get(node, rest) == process)
         if not here:
-            raise top.error('processes', f'no node runs in process {shown(process)}',
+            raise top.error('processes', f'no node runs in process {quoted(process)}',
                             'name one, or remove the process')
         processes.append(Process(process, here))
     return tuple(processes)
@@ -106,7 +106,7 @@ def _callbacks(
     def of_node(numbered: tuple[int, Tree]) -> list[Callback]:
         entry = Entry(numbered[1], f'node {numbered[0]}', NODE_KEYS)
         node = entry.get('node')
-        entry.name = f'node {shown(node)}'
+        entry.name = f'node {quoted(node)}'
         if entry.get('concurrent'):
             concurrent.append(node)
         return for_each(enumerate(entry.get('callbacks'), 1), lambda each: _callback(
@@ -119,7 +119,7 @@ def _callbacks(
 def _callback(entry: Entry, node: str, top: str, entries: dict[str, Entry]) -> Callback:
     name = entry.get('name')
     key = f'{node}:{name}'
-    entry.name = f'callback {shown(key)}'
+    entry.name = f'callback {quoted(key)}'
     kinds = [kind for kind in TRIGGERS if kind in entry]
     if not kinds:
         raise entry.error(
@@ -161,7 +161,7 @@ def _publishes(entry: Entry) -> tuple[str, ...]:
     for topic in sometimes:
         if topic in always:
             raise entry.error(
-                'may_publish', f"{shown(topic)} is under 'publishes:' as well",
+                'may_publish', f"{quoted(topic)} is under 'publishes:' as well",
                 "keep it under 'publishes:' if each execution publishes it, else under "
                 "'may_publish:'", item=topic)
     return always + sometimes
@@ -185,7 +185,7 @@ def _paths(top: Entry, entries: dict[str, Entry]) -> list[Path]:
     def read_path(numbered: tuple[int, Tree]) -> Path:
         entry = Entry(numbered[1], f'path {numbered[0]}', PATH_KEYS)
         name = entry.get('name')
-        entry.name = f'path {shown(name)}'
+        entry.name = f'path {quoted(name)}'
         path = Path(name, entry.get('callbacks'), entry.get('reaction'), entry.get('age'),
                     entry.get('tolerate'))
         if entries.setdefault(name, entry) is not entry:

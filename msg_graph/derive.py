@@ -62,7 +62,7 @@ from msg_graph.errors import (
     for_each,
     GraphError,
     listed,
-    shown,
+    quoted,
 )
 from msg_graph.language import CALLBACK_KEYS, Entry
 from msg_graph.model import Callback, Dag, Path, QueueEdge, TaskSet, Vertex
@@ -109,7 +109,7 @@ def loads(
     """
     text = decode(text, name) if isinstance(text, bytes) else text
     try:
-        with no_garbage():
+        with gc_paused():
             return _derived(
                 *parse_declaration(text, name, None if path is None else fspath(path)),
                 without_deadline)
@@ -119,7 +119,7 @@ def loads(
 
 
 @contextmanager
-def no_garbage() -> Iterator[None]:
+def gc_paused() -> Iterator[None]:
     """
     Switch the cyclic garbage collector off.
 
@@ -139,16 +139,17 @@ def _derived(
     declared: TaskSet, entries: dict[str, Entry], without_deadline: list[str] | None
 ) -> TaskSet:
     links = _Links(declared.callbacks, entries)
-    found = Collector()
-    found(for_each, declared.callbacks, links.check_start)
-    queue_edges = found(
+    errors = Collector()
+    errors.attempt(for_each, declared.callbacks, links.check_start)
+    queue_edges = errors.attempt(
         for_each, [(each, read) for each in declared.callbacks
                    for read in (*each.reads, *each.other_topics)], links.queue_edge)
-    found.check()
-    order = found(links.order)
-    found(for_each, declared.callbacks, lambda each: links.check_end(each, without_deadline))
-    found(for_each, declared.paths, links.check_path)
-    found.check()
+    errors.check()
+    order = errors.attempt(links.order)
+    errors.attempt(
+        for_each, declared.callbacks, lambda each: links.check_end(each, without_deadline))
+    errors.attempt(for_each, declared.paths, links.check_path)
+    errors.check()
     return replace(
         declared, queue_edges=tuple(edge for edge in queue_edges if edge.writers),
         dags=_dags(links, _vertices(links, order)))
@@ -200,15 +201,16 @@ class _Links:
         for topic in callback.triggers:
             publishers = self.publishers.get(topic)
             if is_source and publishers:
+                publisher = self.callbacks[publishers[0]].key
                 raise error('period', 'only a source has a period, but '
-                            f'{shown(self.callbacks[publishers[0]].key)} publishes {shown(topic)}',
+                            f'{quoted(publisher)} publishes {quoted(topic)}',
                             "remove 'period:', or take the topic out of that callback's "
                             "'publishes:'")
             if not is_source and not publishers:
                 remedy = "add it to a 'publishes:'"
                 if callback.kind == 'subscription' or callback.driven_by:
                     remedy += ", or add 'period:' if it comes from outside of the graph"
-                raise error(callback.kind, f'no callback publishes {shown(topic)}',
+                raise error(callback.kind, f'no callback publishes {quoted(topic)}',
                             did_you_mean(topic, self.publishers, remedy), item=topic)
 
     def check_end(self, callback: Callback, without: list[str] | None) -> None:
@@ -217,7 +219,7 @@ class _Links:
         if topic is not None:
             after = self.callbacks[self._started[topic][0]].key
             self._check_keys(callback, ('source',) if _is_source(callback) else (),
-                             f'this callback starts {shown(after)} by {shown(topic)}',
+                             f'this callback starts {quoted(after)} by {quoted(topic)}',
                              "move it to the sinks after it, or read that topic by a queue edge "
                              "('reads:')")
         elif not callback.judged:
@@ -246,7 +248,7 @@ class _Links:
         if read.startswith('/'):
             writers = tuple(self.callbacks[place].key for place in self.publishers.get(read, ()))
             if not writers and read in callback.reads:
-                raise error('reads', f'it reads {shown(read)}, which no callback publishes',
+                raise error('reads', f'it reads {quoted(read)}, which no callback publishes',
                             did_you_mean(read, self.publishers, "add it to a 'publishes:'"),
                             item=read)
             return QueueEdge(callback.key, read, writers)
@@ -254,7 +256,7 @@ class _Links:
         if writer not in self._by_key:
             siblings = [each.name for each in self.callbacks if each.node == callback.node]
             raise error(
-                'reads', f'it reads the unknown callback {shown(read)}',
+                'reads', f'it reads the unknown callback {quoted(read)}',
                 did_you_mean(read, siblings, f'name a callback of its node: {listed(siblings)}'),
                 item=read)
         return QueueEdge(callback.key, None, (writer,))
@@ -264,7 +266,7 @@ class _Links:
         error = self.entries[path.name].error
         for key in path.callbacks:
             if key not in self._by_key:
-                raise error('callbacks', f'unknown callback {shown(key)}',
+                raise error('callbacks', f'unknown callback {quoted(key)}',
                             did_you_mean(key, self._by_key, 'name a declared callback'), item=key)
         for before, after in pairwise(map(self._by_key.__getitem__, path.callbacks)):
             reads_variable = before.node == after.node and before.name in after.reads
@@ -272,7 +274,7 @@ class _Links:
                     after.topics + after.reads):
                 raise error(
                     'callbacks', 'no trigger or queue edge leads from '
-                    f'{shown(before.key)} to {shown(after.key)}',
+                    f'{quoted(before.key)} to {quoted(after.key)}',
                     "name the callbacks between them, or add what is missing to 'reads:'",
                     item=after.key)
 
@@ -349,7 +351,7 @@ def _check_one_source(links: _Links, callback: Callback, before: list[_Vertex]) 
         return
     published = links.callbacks[other.callback].publishes
     topic = next(topic for topic in callback.topics if topic in published)
-    first, second = (shown(links.callbacks[v.source].key) for v in (before[0], other))
+    first, second = (quoted(links.callbacks[v.source].key) for v in (before[0], other))
     raise links.entries[callback.key].error(
         'sync', f'it joins two sources, {first} and {second}, but a DAG has one',
         f"say which topic drives it: 'sync: {{topics: [{', '.join(callback.topics)}], driven_by: "
@@ -386,7 +388,7 @@ def _dag_names(links: _Links, sources: list[int]) -> dict[int, str]:
             other = links.callbacks[taken[name]].key
             raise links.entries[callback.key].error(
                 'dag' if callback.dag else None,
-                f'its DAG has the name {shown(name)}, as that of {shown(other)}',
+                f'its DAG has the name {quoted(name)}, as that of {quoted(other)}',
                 "give it another one with 'dag:'")
         taken[name] = source
         names[source] = name

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from decimal import Decimal, ROUND_HALF_EVEN
 import re
 
-from msg_graph.errors import shown, ValueProblem
+from msg_graph.errors import quoted, ValueProblem
 
 MICROSECOND = 1_000
 MILLISECOND = 1_000_000
@@ -49,17 +49,17 @@ def parse_duration(
     match = _DURATION.fullmatch(text)
     if match is not None and not match['unit']:
         raise DurationError(
-            f'{shown(text)} has no unit',
+            f'{quoted(text)} has no unit',
             f"add one, as '{match['number']}ms' or '{match['number']}s' (ns, us, ms, s, min)")
     if match is None or match['unit'] not in UNITS:
         raise DurationError(
-            f'{shown(text)} is not a time',
+            f'{quoted(text)} is not a time',
             "write a number and a unit (ns, us, ms, s, min), as '100ms'")
     exact = Decimal(match['number']) * UNITS[match['unit']]
     value = int(exact.to_integral_value(ROUND_HALF_EVEN))
     if not minimum_ns <= value <= maximum_ns:
         raise DurationError(
-            f'{shown(text)} is too {"short" if value < minimum_ns else "long"}',
+            f'{quoted(text)} is too {"short" if value < minimum_ns else "long"}',
             f'write {format_duration(minimum_ns)} to {format_duration(maximum_ns)}')
     return value
 
@@ -69,7 +69,7 @@ def format_duration(ns: int) -> str:
     return _in_first_unit(ns, lambda factor: abs(ns) >= factor)
 
 
-def whole_us(ns: float) -> int:
+def round_up_deadline(ns: float) -> int:
     """Round a time up to a valid deadline: whole us, at least one, at most a day."""
     return max(1, -int(-min(DAY, ns) // 1000)) * 1000
 

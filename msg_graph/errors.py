@@ -81,7 +81,7 @@ class Collector:
     def __init__(self) -> None:
         self._errors: list[GraphError] = []
 
-    def __call__(self, work: Callable[..., R], *arguments: Any) -> R:
+    def attempt(self, work: Callable[..., R], *arguments: Any) -> R:
         """Return what a function returns; if it raises an error, ``check`` raises it."""
         result: Any = None  # if it fails; not used then, since ``check`` raises
         try:
@@ -100,9 +100,9 @@ class Collector:
 
 def for_each(items: Iterable[T], work: Callable[[T], R]) -> list[R]:
     """Apply a function to each item; return the results."""
-    found = Collector()
-    results = [found(work, item) for item in items]
-    found.check()
+    errors = Collector()
+    results = [errors.attempt(work, item) for item in items]
+    errors.check()
     return results
 
 
@@ -113,7 +113,7 @@ def printable(text: str) -> str:
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
-def shown(text: str) -> str:
+def quoted(text: str) -> str:
     """Return text from a file in quotes, shortened to one line."""
     if len(text) > _LONGEST_SHOWN:
         text = text[:_LONGEST_SHOWN] + '…'
@@ -123,7 +123,7 @@ def shown(text: str) -> str:
 def listed(texts: Iterable[str], most: int = 8) -> str:
     """Return quoted texts with commas between them; those beyond ``most`` are only counted."""
     every = list(texts)
-    parts = [shown(text) for text in every[:most]]
+    parts = [quoted(text) for text in every[:most]]
     if len(every) > most:
         parts.append(f'… ({len(every) - most} more)')
     return ', '.join(parts)
@@ -132,4 +132,4 @@ def listed(texts: Iterable[str], most: int = 8) -> str:
 def did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for a misspelt word: the nearest known one, else ``otherwise``."""
     matches = difflib.get_close_matches(word[:_LONGEST_SHOWN], list(known), n=1)
-    return f'did you mean {shown(matches[0])}?' if matches else otherwise
+    return f'did you mean {quoted(matches[0])}?' if matches else otherwise

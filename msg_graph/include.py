@@ -30,7 +30,7 @@ import re
 import stat
 from typing import Any
 
-from msg_graph.errors import did_you_mean, GraphError, listed, shown
+from msg_graph.errors import did_you_mean, GraphError, listed, quoted
 from msg_graph.language import Entry, FILE, INCLUDE
 from msg_graph.yamltext import (
     decode,
@@ -47,7 +47,7 @@ import yaml
 MOST_FILES = 2_000
 MOST_DEPTH = 16
 LONGEST_VALUE = 4_096
-_ARGUMENT_USE = re.compile(r'\$\(([^()]*)\)')
+_ARGUMENT_REFERENCE = re.compile(r'\$\(([^()]*)\)')
 _NUMBER = re.compile(r'[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?|true|false')
 _NAMED = ('node', 'subscription', 'service', 'sync', 'publishes', 'may_publish', 'reads')
 
@@ -160,7 +160,7 @@ class _Resolver:
         root = os.path.realpath(os.path.dirname(self._path) or '.')
         if os.path.commonpath([real, root]) != root:
             raise entry.error(
-                'file', f'{shown(text)} lies outside of the folder of the first file',
+                'file', f'{quoted(text)} lies outside of the folder of the first file',
                 'keep all files of a declaration below one folder')
         if real in [path for path, _ in chain]:
             names = ' -> '.join(name for _, name in chain)
@@ -183,7 +183,7 @@ class _Resolver:
                     data = stream.read(MAX_BYTES + 1)
             except (OSError, ValueError) as error:
                 reason = error.strerror if isinstance(error, OSError) else str(error)
-                raise entry.error('file', f'{shown(name)} cannot be read ({reason})',
+                raise entry.error('file', f'{quoted(name)} cannot be read ({reason})',
                                   'correct the path') from None
             self._trees[path] = read(decode(data, name), name)
         return self._trees[path]
@@ -203,7 +203,7 @@ def _argument_values(tree: Mapping, given: dict[str, str]) -> dict[str, str]:
                 "set it with 'set:' of the include, or give it a default here") from None
     for name in [each for each in given if each not in values]:
         raise top.error(
-            'arguments', f'an include sets {shown(name)}, which is not an argument of this file',
+            'arguments', f'an include sets {quoted(name)}, which is not an argument of this file',
             did_you_mean(name, values, "add it to 'arguments:'"))
     return values
 
@@ -212,12 +212,12 @@ def _substituted(old: Scalar, values: dict[str, str]) -> str:
     def value(found: re.Match[str]) -> str:
         if found[1] not in values:
             raise GraphError(
-                old.file, old.line, f'{shown(found[0])} is not an argument of this file',
+                old.file, old.line, f'{quoted(found[0])} is not an argument of this file',
                 did_you_mean(found[1], values, f"add it to 'arguments:' ({listed(values)})"
                              if values else "add it to 'arguments:'"))
         return values[found[1]]
 
-    text = _ARGUMENT_USE.sub(value, old.text)
+    text = _ARGUMENT_REFERENCE.sub(value, old.text)
     if len(text) > LONGEST_VALUE and text != old.text:
         raise GraphError(old.file, old.line, 'with its arguments this value is too long',
                          f'use at most {LONGEST_VALUE} characters')
@@ -270,7 +270,7 @@ def _renamed(entry: Entry, inner: Mapping) -> Mapping:
         _rename(each, ('name',), path)
     for old in remap:
         if old not in seen:
-            raise remapped.error(old, f'the included file does not name {shown(old)}',
+            raise remapped.error(old, f'the included file does not name {quoted(old)}',
                                  did_you_mean(old, seen, "remove it from 'remap:'"))
     return inner
 

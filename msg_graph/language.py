@@ -9,9 +9,9 @@ An *entry* is a mapping of the declaration. A table lists its keys, each with th
 value. A kind reads a value, and has its part of the JSON Schema. So the tables below are the only
 description of a file: the parser uses them, and the JSON Schema is made from them.
 
-There are three kinds: a single value (``scalar``), a list (``many``) and a mapping with keys of
-the user (``table``). A single value is text; a function turns it into a time, a name, … or says
-what is wrong with it. Errors name the entry and the key (*where*), file and line.
+There are three kinds: a single value (``scalar``), a list (``list_of``) and a mapping with keys of
+the user (``mapping_of``). A single value is text; a function turns it into a time, a name, … or
+says what is wrong with it. Errors name the entry and the key (*where*), file and line.
 
 The schema is of draft 7, the one best supported by language servers for YAML. It describes single
 entries; only ``load`` checks the rules about several (publishers, cycles, sinks).
@@ -28,13 +28,13 @@ import re
 from typing import Any
 
 from msg_graph.duration import DAY, MICROSECOND, parse_duration, UNITS
-from msg_graph.errors import did_you_mean, GraphError, shown, ValueProblem
+from msg_graph.errors import did_you_mean, GraphError, quoted, ValueProblem
 from msg_graph.model import ExecutionTime, MOST_WORKERS, WeaklyHard
 from msg_graph.yamltext import Mapping, Scalar, Sequence, Tree
 
 Schema = dict[str, Any]
 
-ARGUMENT_USE = r'\$\([A-Za-z_][A-Za-z0-9_]*\)'
+ARGUMENT_REFERENCE = r'\$\([A-Za-z_][A-Za-z0-9_]*\)'
 """An argument of the file in a value; the JSON Schema allows it in all values."""
 
 _DRIVEN = "write it inside of the sync, as 'sync: {topics: [/a, /b], driven_by: /a}'"
@@ -42,9 +42,9 @@ ELSEWHERE = {'driven_by': _DRIVEN, 'topics': _DRIVEN}
 """Keys that are often written in the wrong place, and where they belong."""
 
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
-_OF = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
+_TOLERANCE_PATTERN = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
 _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
-_USE: Schema = {'type': 'string', 'pattern': ARGUMENT_USE}
+_REFERENCE_SCHEMA: Schema = {'type': 'string', 'pattern': ARGUMENT_REFERENCE}
 _ROS_NAME = re.compile(r'(?:/[A-Za-z_][A-Za-z0-9_]*)+')
 _WORD = re.compile(r'[A-Za-z0-9_][A-Za-z0-9_.-]*')
 
@@ -72,14 +72,14 @@ class Name:
         """Return a name; raise ``ValueProblem`` if it is not valid."""
         problem, remedy = '', ''
         if self.is_global and not text.startswith('/'):
-            problem = f'{shown(text)} is not an absolute {self.what} name'
-            remedy = f'write it in full, as {shown("/" + text.lstrip("~/"))}'
+            problem = f'{quoted(text)} is not an absolute {self.what} name'
+            remedy = f'write it in full, as {quoted("/" + text.lstrip("~/"))}'
         elif not self.pattern.fullmatch(text):
-            problem = f'{shown(text)} is not a valid {self.what} name'
+            problem = f'{quoted(text)} is not a valid {self.what} name'
             remedy = ("use '/' and words of letters, digits and '_' that start with no digit"
                       if self.is_global else f'use {self.allowed}')
         elif len(text) > self.longest:
-            problem = f'the {self.what} name {shown(text)} is too long'
+            problem = f'the {self.what} name {quoted(text)} is too long'
             remedy = f'use at most {self.longest} characters'
         if problem:
             raise ValueProblem(problem, remedy)
@@ -95,7 +95,8 @@ class Name:
         return {
             # YAML reads some short names as numbers, and this program does not.
             'type': 'string' if self.is_global else ['string', 'integer'],
-            'pattern': f'^(?:{self.pattern.pattern})$|{ARGUMENT_USE}', 'maxLength': self.longest}
+            'pattern': f'^(?:{self.pattern.pattern})$|{ARGUMENT_REFERENCE}',
+            'maxLength': self.longest}
 
 
 NODE = Name('node', _ROS_NAME)  # after rmw_validate_node_name and its namespaces
@@ -113,7 +114,7 @@ ARGUMENT = Name('argument', re.compile(r'[A-Za-z_][A-Za-z0-9_]*'),
 def kind_of(tree: Tree) -> str:
     """Return a description of a tree."""
     if isinstance(tree, Scalar):
-        return 'an empty value' if tree.is_null else f'the text {shown(tree.text)}'
+        return 'an empty value' if tree.is_null else f'the text {quoted(tree.text)}'
     return 'a list' if isinstance(tree, Sequence) else 'a mapping'
 
 
@@ -172,7 +173,7 @@ class Entry:
         for key in tree.entries:
             if key not in keys:
                 remedy = ELSEWHERE.get(key) or did_you_mean(key, keys, f'use {", ".join(keys)}')
-                raise self.error(key, f'unknown key {shown(key)}', remedy)
+                raise self.error(key, f'unknown key {quoted(key)}', remedy)
 
     def __contains__(self, key: str) -> bool:
         return key in self._tree.entries
@@ -186,11 +187,11 @@ class Entry:
         described = self._keys[key]
         if value is None:
             if described.needed:
-                raise self.error(None, f'{shown(key)} is missing', f'add {shown(key + ":")}')
+                raise self.error(None, f'{quoted(key)} is missing', f'add {quoted(key + ":")}')
             return described.kind.missing
         if isinstance(value, Scalar) and value.is_null:
-            raise self.error(key, f'{shown(key)} has no value', 'give it one or remove the key')
-        return described.kind.read(value, f'{self.name}: {shown(key)}')
+            raise self.error(key, f'{quoted(key)} has no value', 'give it one or remove the key')
+        return described.kind.read(value, f'{self.name}: {quoted(key)}')
 
     def line_of(self, key: str, item: str | None = None) -> int:
         """Return the line of a key, or of an item of the list there; else the mapping's line."""
@@ -232,7 +233,7 @@ def scalar(
     return Kind(read, form, missing)
 
 
-def many(item: Kind, least: int = 1, different: bool = False, too_few: str = '') -> Kind:
+def list_of(item: Kind, least: int = 1, different: bool = False, too_few: str = '') -> Kind:
     """
     Return the kind of a list, read as a tuple.
 
@@ -250,14 +251,14 @@ def many(item: Kind, least: int = 1, different: bool = False, too_few: str = '')
         if different and len(set(found)) < len(found):
             place = next(i for i, each in enumerate(found) if each in found[:i])
             raise error_at(value.items[place], where,
-                           f'{shown(found[place])} is listed twice', 'remove one of them')
+                           f'{quoted(found[place])} is listed twice', 'remove one of them')
         return tuple(found)
 
     form = {'type': 'array', 'items': item.schema, 'minItems': least}
     return Kind(read, {**form, 'uniqueItems': True} if different else form, ())
 
 
-def table(values: Kind, names: Name | None = None) -> Kind:
+def mapping_of(values: Kind, names: Name | None = None) -> Kind:
     """Return the kind of a mapping with keys of the user, read as an ``Entry``."""
     key = Key(values, '')
 
@@ -277,7 +278,7 @@ def table(values: Kind, names: Name | None = None) -> Kind:
 
 # --- single values -------------------------------------------------------------------------------
 
-def name(what: Name) -> Kind:
+def name_kind(what: Name) -> Kind:
     """Return the kind of a name."""
     return scalar(what.check, what.schema, what=f'a {what.what} name')
 
@@ -292,17 +293,17 @@ def choice(
     """
     def parse(word: str) -> str:
         if gone is not None and word in gone:
-            raise ValueProblem(f'{shown(word)} is gone', gone[word])
+            raise ValueProblem(f'{quoted(word)} is gone', gone[word])
         if word not in words:
-            raise ValueProblem(f'{shown(word)} is not known',
+            raise ValueProblem(f'{quoted(word)} is not known',
                                did_you_mean(word, words, f'use {", ".join(words)}'))
         return word
 
-    return scalar(parse, {'anyOf': [{'enum': list(words)}, _USE]}, missing,
+    return scalar(parse, {'anyOf': [{'enum': list(words)}, _REFERENCE_SCHEMA]}, missing,
                   what=f'one of {", ".join(words)}')
 
 
-def time(least_ns: int = MICROSECOND) -> Kind:
+def duration_kind(least_ns: int = MICROSECOND) -> Kind:
     """Return the kind of a time of at most a day, ns."""
     return scalar(lambda text: parse_duration(text, minimum_ns=least_ns),
                   {'allOf': [{'$ref': '#/definitions/time'}]}, what="a time, as '100ms'")
@@ -313,11 +314,11 @@ def whole(least: int, most: int) -> Kind:
     def parse(text: str) -> int:
         if not (_INTEGER.fullmatch(text) and least <= int(text) <= most):
             raise ValueProblem(
-                f'{shown(text)} is not an integer from {least} to {most}', 'write one')
+                f'{quoted(text)} is not an integer from {least} to {most}', 'write one')
         return int(text)
 
     return scalar(parse, {'anyOf': [
-        {'type': 'integer', 'minimum': least, 'maximum': most}, _USE]},
+        {'type': 'integer', 'minimum': least, 'maximum': most}, _REFERENCE_SCHEMA]},
         what=f'an integer from {least} to {most}')
 
 
@@ -326,15 +327,16 @@ def number(**bounds: int) -> Kind:
     def parse(text: str) -> float:
         found = float(text) if _NUMBER.fullmatch(text) else math.nan
         if not math.isfinite(found):
-            raise ValueProblem(f'{shown(text)} is not a number', 'write a finite number')
+            raise ValueProblem(f'{quoted(text)} is not a number', 'write a finite number')
         return found
 
-    return scalar(parse, {'anyOf': [{'type': 'number', **bounds}, _USE]}, what='a finite number')
+    return scalar(parse, {'anyOf': [{'type': 'number', **bounds}, _REFERENCE_SCHEMA]},
+                  what='a finite number')
 
 
 def _truth(text: str) -> bool:
     if text not in ('true', 'false'):
-        raise ValueProblem(f'{shown(text)} is neither true nor false', 'write one of them')
+        raise ValueProblem(f'{quoted(text)} is neither true nor false', 'write one of them')
     return text == 'true'
 
 
@@ -351,9 +353,9 @@ def _deadline(text: str) -> int | str:
 
 
 def _weakly_hard(text: str) -> WeaklyHard:
-    found = _OF.fullmatch(text)
+    found = _TOLERANCE_PATTERN.fullmatch(text)
     if found is None or not 0 < int(found[1]) < int(found[2]):
-        raise ValueProblem(f'{shown(text)} is not a tolerance',
+        raise ValueProblem(f'{quoted(text)} is not a tolerance',
                            "write how many of how many, as '1 of 100', but not all")
     return WeaklyHard(int(found[1]), int(found[2]))
 
@@ -364,13 +366,13 @@ FORMAT = '1'
 def _format(given: str) -> str:
     if given != FORMAT:
         raise ValueProblem(
-            f'{shown(given)} is not a known version of the format', f"write 'mddag: {FORMAT}'")
+            f'{quoted(given)} is not a known version of the format', f"write 'mddag: {FORMAT}'")
     return given
 
 
 def _file(path: str) -> str:
     if os.path.isabs(path) or path.startswith('~') or '\0' in path or not path:
-        raise ValueProblem(f'{shown(path)} is not a relative path',
+        raise ValueProblem(f'{quoted(path)} is not a relative path',
                            'write it as seen from the file that includes it')
     return path
 
@@ -379,7 +381,7 @@ def _read(text: str) -> str:
     """Check an entry of ``reads``: a topic, or the name of a callback of the same node."""
     if ':' in text:
         raise ValueProblem(
-            f'{shown(text)} names a callback with its node',
+            f'{quoted(text)} names a callback with its node',
             'name the topic that is taken, or just the name of a callback of the same node')
     return (TOPIC if text.startswith('/') else CALLBACK).check(text)
 
@@ -388,7 +390,7 @@ def _key(text: str) -> str:
     """Check the key of a callback, ``/node:callback``."""
     node, colon, name = text.rpartition(':')
     if not colon:
-        raise ValueProblem(f'{shown(text)} does not name a callback', "write '/node:callback'")
+        raise ValueProblem(f'{quoted(text)} does not name a callback', "write '/node:callback'")
     NODE.check(node)
     CALLBACK.check(name)
     return text
@@ -398,7 +400,7 @@ def _key(text: str) -> str:
 
 def _read_execution_time(value: Tree, where: str) -> ExecutionTime:
     if isinstance(value, Scalar):
-        return ExecutionTime((time(least_ns=1).read(value, where),), (50.0,))
+        return ExecutionTime((duration_kind(least_ns=1).read(value, where),), (50.0,))
     entry = Entry(value, where, QUANTILES)
     quantiles_us, percent = entry.get('quantiles_us'), entry.get('percent')
     count = len(quantiles_us)
@@ -424,7 +426,7 @@ def _read_sync(value: Tree, where: str) -> tuple[tuple[str, ...], str | None]:
     entry = Entry(value, where, SYNC_KEYS)
     topics, driven_by = entry.get('topics'), entry.get('driven_by')
     if driven_by not in topics:
-        raise entry.error('driven_by', f'{shown(driven_by)} is none of its topics',
+        raise entry.error('driven_by', f'{quoted(driven_by)} is none of its topics',
                           did_you_mean(driven_by, topics, "add it to 'topics:'"))
     return (driven_by, *(topic for topic in topics if topic != driven_by)), driven_by
 
@@ -433,7 +435,7 @@ def _read_sync(value: Tree, where: str) -> tuple[tuple[str, ...], str | None]:
 
 def _entries(what: str) -> Kind:
     """Return the kind of a list whose items are read as entries later."""
-    return many(Kind(lambda value, where: value, {'$ref': f'#/definitions/{what}'}))
+    return list_of(Kind(lambda value, where: value, {'$ref': f'#/definitions/{what}'}))
 
 
 def _mapping(keys: dict[str, Key]) -> Schema:
@@ -443,27 +445,30 @@ def _mapping(keys: dict[str, Key]) -> Schema:
                            for word, key in keys.items()}}
 
 
-_TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _USE]}, what='true or false')
+_TRUTH = scalar(_truth, {'anyOf': [{'type': 'boolean'}, _REFERENCE_SCHEMA]}, what='true or false')
 _FLAG = scalar(_truth, _TRUTH.schema, False, what='true or false')
-_DEADLINE = scalar(_deadline, {'anyOf': [time().schema, {'enum': [NO_DEADLINE]}]},
+_DEADLINE = scalar(_deadline, {'anyOf': [duration_kind().schema, {'enum': [NO_DEADLINE]}]},
                    what="a time, as '100ms', or none")
 _WEAKLY_HARD = scalar(_weakly_hard, {
-    'type': 'string', 'pattern': f'^(?:{_OF.pattern})$|{ARGUMENT_USE}', 'examples': ['1 of 100']})
-_VALUES = table(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}), ARGUMENT)
-_TOPICS = many(name(TOPIC), 0, different=True)
+    'type': 'string', 'pattern': f'^(?:{_TOLERANCE_PATTERN.pattern})$|{ARGUMENT_REFERENCE}',
+    'examples': ['1 of 100']})
+_VALUES = mapping_of(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}), ARGUMENT)
+_TOPICS = list_of(name_kind(TOPIC), 0, different=True)
 
 QUANTILES = {
-    'quantiles_us': Key(many(number(minimum=0)), 'Quantiles in us, rising.', needed=True),
-    'percent': Key(many(number(minimum=0, maximum=100)),
+    'quantiles_us': Key(list_of(number(minimum=0)), 'Quantiles in us, rising.', needed=True),
+    'percent': Key(list_of(number(minimum=0, maximum=100)),
                    'The shares that they belong to, rising.'),
 }
-_EXECUTION_TIME = Kind(_read_execution_time, {'oneOf': [time().schema, _mapping(QUANTILES)]})
+_EXECUTION_TIME = Kind(
+    _read_execution_time, {'oneOf': [duration_kind().schema, _mapping(QUANTILES)]})
 
-_SYNCED = many(name(TOPIC), 2, different=True,
-               too_few="give at least 2, or write 'subscription:' for one topic")
+_SYNCED = list_of(name_kind(TOPIC), 2, different=True,
+                  too_few="give at least 2, or write 'subscription:' for one topic")
 SYNC_KEYS = {
     'topics': Key(_SYNCED, 'The topics.', needed=True),
-    'driven_by': Key(name(TOPIC), 'The one each message of which has a result. The others are '
+    'driven_by': Key(name_kind(TOPIC),
+                     'The one each message of which has a result. The others are '
                      'queue edges.', needed=True),
 }
 _SYNC = Kind(_read_sync, {'oneOf': [_SYNCED.schema, _mapping(SYNC_KEYS)]}, ((), None))
@@ -479,7 +484,7 @@ FILE = {
     'nodes': Key(_entries('node'),
                  'The nodes; a node may have several entries, and their order counts for ties.',
                  needed=True),
-    'processes': Key(table(many(name(NODE), 0, different=True), PROCESS),
+    'processes': Key(mapping_of(list_of(name_kind(NODE), 0, different=True), PROCESS),
                      'The processes that the nodes run in, each with its nodes; those '
                      'that are not named run in the first.'),
     'paths': Key(_entries('path'), 'End-to-end paths over trigger and queue edges.'),
@@ -487,30 +492,30 @@ FILE = {
 INCLUDE = {
     'file': Key(scalar(_file, {'type': 'string'}), 'The file, as seen from this one.',
                 needed=True),
-    'namespace': Key(name(NODE), 'Put before all names of the included file.'),
-    'remap': Key(table(name(TOPIC)), 'Names of the included file and what they become.'),
+    'namespace': Key(name_kind(NODE), 'Put before all names of the included file.'),
+    'remap': Key(mapping_of(name_kind(TOPIC)), 'Names of the included file and what they become.'),
     'set': Key(_VALUES, 'Values of the arguments of the included file.'),
 }
 NODE_KEYS = {
-    'node': Key(name(NODE), 'Fully qualified name of the node.', needed=True),
+    'node': Key(name_kind(NODE), 'Fully qualified name of the node.', needed=True),
     'callbacks': Key(_entries('callback'), 'Its callbacks.', needed=True),
     'concurrent': Key(_FLAG, 'Whether its callbacks may overlap with others of its program, even '
                       'if the program spins in a single thread.'),
 }
 TRIGGERS = {
-    'timer': Key(time(), 'A timer of this period starts it.'),
-    'subscription': Key(name(TOPIC), 'A message on this topic starts it.'),
+    'timer': Key(duration_kind(), 'A timer of this period starts it.'),
+    'subscription': Key(name_kind(TOPIC), 'A message on this topic starts it.'),
     'sync': Key(_SYNC, 'Messages on all of these topics together start it; of topics with '
                 'different rates, one drives it.'),
-    'service': Key(name(SERVICE), 'A request of this service starts it.'),
+    'service': Key(name_kind(SERVICE), 'A request of this service starts it.'),
 }
 CALLBACK_KEYS = {
-    'name': Key(name(CALLBACK), 'Name of the callback, unique in its node.', needed=True),
+    'name': Key(name_kind(CALLBACK), 'Name of the callback, unique in its node.', needed=True),
     **TRIGGERS,
-    'period': Key(time(), 'Time between two releases of a source that is not a timer.'),
+    'period': Key(duration_kind(), 'Time between two releases of a source that is not a timer.'),
     'publishes': Key(_TOPICS, 'The topics that it publishes in each execution.'),
     'may_publish': Key(_TOPICS, 'Further topics, which it publishes only in some executions.'),
-    'reads': Key(many(scalar(_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
+    'reads': Key(list_of(scalar(_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
                       different=True),
                  'Queue edges: topics that it takes messages from, and callbacks of its node '
                  'whose variables it reads. They never start it.'),
@@ -525,8 +530,8 @@ CALLBACK_KEYS = {
     'execution_time': Key(_EXECUTION_TIME, 'Its execution time: constant, or quantiles.'),
     'holds_interpreter': Key(_TRUTH, 'Whether it computes in Python (true), or waits, or '
                              'computes with the lock of the interpreter released (false).'),
-    'group': Key(name(GROUP), 'Its mutually exclusive callback group in the node.'),
-    'dag': Key(name(DAG), 'Name of the DAG that it is the source of.', of=('source',)),
+    'group': Key(name_kind(GROUP), 'Its mutually exclusive callback group in the node.'),
+    'dag': Key(name_kind(DAG), 'Name of the DAG that it is the source of.', of=('source',)),
     'on_late': Key(choice('continue', 'demote', gone={
         'abort': "use 'demote', or 'keep: newest' to drop what a newer message replaces"}),
                    'What is done with a late job of its DAG, if it is a source.', of=('source',)),
@@ -543,14 +548,15 @@ CALLBACK_KEYS = {
                            of=('source',)),
 }
 PATH_KEYS = {
-    'name': Key(name(PATH), 'Name of the path.', needed=True),
-    'callbacks': Key(many(scalar(_key, {'type': 'string', 'pattern': (
-        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_USE}')}),
+    'name': Key(name_kind(PATH), 'Name of the path.', needed=True),
+    'callbacks': Key(list_of(scalar(_key, {'type': 'string', 'pattern': (
+        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_REFERENCE}')}),
         2, different=True, too_few='give at least 2'),
         "The callbacks along it, each as '/node:callback'.", needed=True),
-    'reaction': Key(time(), 'Maximum reaction time: from a change right after an input of the '
+    'reaction': Key(duration_kind(),
+                    'Maximum reaction time: from a change right after an input of the '
                     'first callback to the end of the first output that has seen it.'),
-    'age': Key(time(), 'Maximum data age: from the input to the end of each output.'),
+    'age': Key(duration_kind(), 'Maximum data age: from the input to the end of each output.'),
     'tolerate': Key(_WEAKLY_HARD, 'How many inputs or outputs in a row may be late, as '
                     "'1 of 100'."),
 }
@@ -574,7 +580,7 @@ def schema() -> Schema:
             'time': {
                 'type': 'string',
                 'pattern': rf'^[ \t]*([0-9]+(\.[0-9]*)?|\.[0-9]+)[ \t]*({"|".join(UNITS)})'
-                           rf'[ \t]*$|{ARGUMENT_USE}',
+                           rf'[ \t]*$|{ARGUMENT_REFERENCE}',
                 'examples': ['100ms', '20us', '1.5s'],
             },
         },

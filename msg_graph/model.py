@@ -350,13 +350,13 @@ class TaskSet:
                         deadline_ns=new[vertex.callback.key].deadline_ns)
                 for vertex in dag.vertices)) for dag in self.dags))
 
-    def places(self) -> dict[str, int]:
+    def callback_indices(self) -> dict[str, int]:
         """Return the index of each callback in ``callbacks``, by its key."""
         return {callback.key: place for place, callback in enumerate(self.callbacks)}
 
     def places_of_vertices(self) -> list[int]:
         """Return by vertex (see ``vertices``) the index of its callback in ``callbacks``."""
-        places = self.places()
+        places = self.callback_indices()
         return [places[vertex.callback.key] for vertex in self.vertices]
 
 
@@ -427,5 +427,5 @@ def load_of(dag: Dag) -> float | None:
     return 0.0 if dag.once else None if means is None else sum(means) / dag.period_ns
 
 
-NO_GRAPH = TaskSet((), (), (), (), None, '', '')
+EMPTY_TASK_SET = TaskSet((), (), (), (), None, '', '')
 """The task set without a declaration."""

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 import re
 from typing import Any, ClassVar
 
-from msg_graph.errors import GraphError, shown
+from msg_graph.errors import GraphError, quoted
 import yaml
 
 MAX_BYTES = 16 * 1024 * 1024
@@ -113,7 +113,7 @@ def parse_yaml(text: str, file: str) -> Tree | None:
     if strange is not None:
         raise GraphError(
             file, text.count('\n', 0, strange.start()) + 1,
-            f'the file holds the character {shown(strange.group())}, so it is not YAML',
+            f'the file holds the character {quoted(strange.group())}, so it is not YAML',
             'give the YAML file of a declaration')
     if len(text.encode()) > MAX_BYTES:
         decode(text.encode(), file)
@@ -159,7 +159,7 @@ class _Builder:
             return self._anchored(event)
         if event.tag not in _PLAIN_TAGS:
             raise self._error(
-                event, f'the tag {shown(event.tag)} has no meaning here', 'remove the tag')
+                event, f'the tag {quoted(event.tag)} has no meaning here', 'remove the tag')
         line = event.start_mark.line + 1
         if kind is yaml.ScalarEvent:
             scalar = Scalar(self._file, line, event.value, not event.style)
@@ -179,7 +179,7 @@ class _Builder:
         return tree
 
     def _anchored(self, event: Any) -> Tree:
-        name = shown(event.anchor)
+        name = quoted(event.anchor)
         tree = self._anchors.get(event.anchor)
         if tree is None:
             raise self._error(
@@ -213,7 +213,7 @@ class _Builder:
             raise self._error(event, 'a key is a list or a mapping', 'write a plain word as key')
         if tree.text in parent.entries:
             raise self._error(
-                event, f'the key {shown(tree.text)} is given twice',
+                event, f'the key {quoted(tree.text)} is given twice',
                 f'remove one of them (the first is in line {parent.key_lines[tree.text]})')
         parent.key_lines[tree.text] = event.start_mark.line + 1
         return tree.text

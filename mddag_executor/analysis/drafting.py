@@ -37,7 +37,7 @@ from mddag_executor.sources.head import named_errors, read_head
 from mddag_executor.sources.open import open_recording
 from mddag_executor.trace import TraceReader
 from msg_graph import Callback as Declared
-from msg_graph import ExecutionTime, NO_GRAPH, TaskSet
+from msg_graph import EMPTY_TASK_SET, ExecutionTime, TaskSet
 from msg_graph.binding import function_of, is_background
 from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath, leave_out_sources
 from msg_graph.duration import DAY, exact_duration
@@ -90,7 +90,7 @@ class System:
         with named_errors(os.fspath(path), self.name):
             reader = TraceReader(path)
             head = read_head(reader)
-            graph = None if head is None or is_declared(head) else NO_GRAPH
+            graph = None if head is None or is_declared(head) else EMPTY_TASK_SET
             recording = open_recording(reader, graph, self.name, progress)
         declared = recording.declared
         self.task_set: TaskSet | None = recording.task_set if declared else None
@@ -214,7 +214,7 @@ class System:
         by_name = [nodes[name] for name in sorted(nodes)]
         if self.task_set is None:
             return by_name
-        place = self.task_set.places()
+        place = self.task_set.callback_indices()
         every = [callback for node in by_name for callback in node.callbacks.values()]
         found: list[DraftNode] = []
         for callback in sorted(every, key=lambda c: place.get(c.key, len(place))):
@@ -230,7 +230,7 @@ class System:
             DraftPath(path.name, [], list(path.callbacks), {
                 **{what: exact_duration(time) for what, time in path.requirements.items()},
                 **({} if path.tolerate is None else {'tolerate': str(path.tolerate)})})
-            for path in (self.task_set or NO_GRAPH).paths
+            for path in (self.task_set or EMPTY_TASK_SET).paths
             if every.keys() >= set(path.callbacks) and all(
                 not {*before.publishes, before.name}.isdisjoint(after.starts + after.reads)
                 for before, after in pairwise(every[key] for key in path.callbacks))]

@@ -158,7 +158,7 @@ class Paths:
             {topic for path in self.hops for hop in path for topic in hop.topics}))}
         self._nodes = {node: i for i, node in enumerate(
             dict.fromkeys(c.node for c in task_set.callbacks))}
-        self._places = task_set.places()
+        self._places = task_set.callback_indices()
         # by vertex the index of its callback; the last entry is for none
         self._place = np.array([*task_set.places_of_vertices(), NONE], dtype=np.int32)
         table = recording.executions

@@ -176,7 +176,7 @@ class Usage:
 
     def __init__(self, recording: Recording, waited: Ints, begin: int, end: int) -> None:
         task_set = recording.task_set
-        self._places = task_set.places()
+        self._places = task_set.callback_indices()
         # by global vertex the index of its callback; the last entry is for undeclared ones
         self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
         self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)

@@ -275,17 +275,18 @@ def write_result(args: argparse.Namespace, result: Any) -> bool:
 
 
 def show(
-    args: argparse.Namespace, result: Any, lines: Iterable[str], aside: bool = False
+    args: argparse.Namespace, result: Any, lines: Iterable[str], tables_to_stderr: bool = False
 ) -> None:
     """
     Write a result to the file of `--json`, and print its lines if people read the output.
 
-    :param aside: print them on standard error if the output of `--output` is on standard output.
+    :param tables_to_stderr: if the file of `--output` is standard output, print the lines on
+        standard error.
     """
-    aside = aside and args.output == '-' and not is_quiet()
-    if write_result(args, result) or aside:
+    tables_to_stderr = tables_to_stderr and args.output == '-' and not is_quiet()
+    if write_result(args, result) or tables_to_stderr:
         for line in lines:
-            print(line, file=sys.stderr if aside else sys.stdout)
+            print(line, file=sys.stderr if tables_to_stderr else sys.stdout)
 
 
 def wants_tables(args: argparse.Namespace) -> bool:

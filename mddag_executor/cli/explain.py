@@ -63,13 +63,13 @@ def main(args: argparse.Namespace) -> int:
 
 def _sink(name: str, task_set: TaskSet) -> int:
     """Return the global vertex of a sink, given by its name or a unique end of it."""
-    from msg_graph.errors import did_you_mean, listed, shown
+    from msg_graph.errors import did_you_mean, listed, quoted
     sinks = {v.name: i for i, v in enumerate(task_set.vertices) if v.deadline_ns is not None}
     found = [name] if name in sinks else [each for each in sinks if each.endswith(name)]
     if len(found) > 1:
-        raise UsageError(f'--sink: {shown(name)} may be any of {listed(found)}: write more of it')
+        raise UsageError(f'--sink: {quoted(name)} may be any of {listed(found)}: write more of it')
     if not found:
-        raise UsageError(f'--sink: there is no sink {shown(name)}: ' + did_you_mean(
+        raise UsageError(f'--sink: there is no sink {quoted(name)}: ' + did_you_mean(
             name, sinks, 'mddag graph check lists them'))
     return sinks[found[0]]
 

@@ -62,7 +62,7 @@ def main(args: argparse.Namespace) -> int:
     result: dict[str, Any] = {
         'policy': args.policy, 'budget': args.budget, 'deadlines_ns': deadlines,
         **({'requirements': required} if required else {}), 'acceptance': measured.result()}
-    common.show(args, result, _lines(args, task_set, result, measured), aside=True)
+    common.show(args, result, _lines(args, task_set, result, measured), tables_to_stderr=True)
     return 0
 
 

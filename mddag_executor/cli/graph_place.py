@@ -66,7 +66,7 @@ def main(args: argparse.Namespace) -> int:
         'processes': [{'name': p.name, 'nodes': p.nodes} for p in processes],
         'loads': [loads[place[placing.block_of(p.nodes[0])]] for p in processes]}
     common.write_text(args.output, with_processes(task_set, processes).text)
-    common.show(args, result, _lines(result), aside=True)
+    common.show(args, result, _lines(result), tables_to_stderr=True)
     return 0
 
 

@@ -257,7 +257,7 @@ def add(
         parser.add_argument(*(('-o', name) if name == '--output' else (name,)), **kept)
 
 
-def refuse(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
+def reject_options(args: argparse.Namespace, names: Iterable[str], why: str) -> None:
     """Refuse options that are given."""
     for name in names:
         if getattr(args, name) is not None:

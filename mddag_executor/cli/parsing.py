@@ -44,9 +44,9 @@ class Parser(argparse.ArgumentParser):
 
 def unknown(prog: str, kind: str, word: str, known: Iterable[str]) -> UsageError:
     """Return the error about a verb or option that does not exist."""
-    from msg_graph.errors import did_you_mean, shown
+    from msg_graph.errors import did_you_mean, quoted
     remedy = did_you_mean(word, known, f"see '{prog} --help'")
-    return UsageError(f'{prog}: there is no {kind} {shown(word)}: {remedy}')
+    return UsageError(f'{prog}: there is no {kind} {quoted(word)}: {remedy}')
 
 
 def _is_option(word: str) -> bool:

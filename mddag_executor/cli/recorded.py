@@ -69,7 +69,7 @@ def check(args: argparse.Namespace) -> None:
             raise UsageError(
                 '--callbacks: it shows what was recorded: leave it or --reschedule out')
         return
-    options.refuse(args, _ONLY_RESCHEDULED,
+    options.reject_options(args, _ONLY_RESCHEDULED,
                    'a run is replayed as it was recorded: add --reschedule')
 
 
@@ -147,7 +147,7 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
         'on_late': args.on_late, 'skip': args.begin or 0, 'cpus': args.cpus, 'name': source.name}
     if source.is_bag:
         return _rescheduled_bag(args, source, settings)
-    options.refuse(args, ('execution_times', 'seed'),
+    options.reject_options(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
     from mddag_executor.whatif.reschedule import reschedule
     with Progress('replaying') as line:

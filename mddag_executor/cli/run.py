@@ -34,7 +34,7 @@ from mddag_executor.errors import from_user_code, MddagError, UsageError, UserCo
 from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.text import listed
-from msg_graph import loads, NO_GRAPH
+from msg_graph import EMPTY_TASK_SET, loads
 
 if TYPE_CHECKING:
     from mddag_executor.executor.executor import MultiDeadlineExecutor
@@ -124,7 +124,7 @@ def main(args: argparse.Namespace) -> int:
     _check_arguments(args)
     if args.part is not None:
         return part(args)
-    task_set = NO_GRAPH if args.graph is None else common.load_graph(args.graph)
+    task_set = EMPTY_TASK_SET if args.graph is None else common.load_graph(args.graph)
     if args.processes not in (None, '1') or (task_set.processes and args.processes is None):
         from mddag_executor.cli.run_processes import run_processes, with_declared
         if args.process is None:

@@ -30,7 +30,7 @@ from mddag_executor.output_rules import remove_recording
 from mddag_executor.report.live_runs import live_lines
 from msg_graph import TaskSet
 from msg_graph.edit import load_processes, with_processes
-from msg_graph.errors import did_you_mean, listed, shown
+from msg_graph.errors import did_you_mean, listed, quoted
 
 _PROBE_TIMEOUT_S = 120.0
 
@@ -153,7 +153,7 @@ def _placed(
         if equals and name in names:
             said[spec] = name
         elif equals and not {*'/: '} & {*name}:
-            raise UsageError(f'--node {spec}: there is no process {shown(name)}: '
+            raise UsageError(f'--node {spec}: there is no process {quoted(name)}: '
                              + did_you_mean(name, names, 'name one of the declaration'))
     unsaid = [spec for spec in args.node if spec not in said]
     nodes = _probe(args, folder, unsaid) if unsaid else {}
@@ -165,7 +165,7 @@ def _placed(
         specs[name].append(spec.removeprefix(f'{name}=') if spec in said else spec)
     for process in task_set.processes:
         if args.node and not specs[process.name]:
-            raise UsageError(f'process {shown(process.name)}: no --node brings one of its nodes '
+            raise UsageError(f'process {quoted(process.name)}: no --node brings one of its nodes '
                              f'({listed(process.nodes)}): give it, or remove the process')
     return task_set, specs
 
@@ -191,8 +191,8 @@ def _process_of(task_set: TaskSet, spec: str, nodes: Sequence[str]) -> str:
     if len(found) > 1:
         (one, a), (other, b), *_ = found.items()
         raise UsageError(
-            f'--node {spec}: it brings {a}, which is to run in process {shown(one)}, and {b}, in '
-            f'{shown(other)}: put both into one process')
+            f'--node {spec}: it brings {a}, which is to run in process {quoted(one)}, and {b}, in '
+            f'{quoted(other)}: put both into one process')
     return next(iter(found), task_set.processes[0].name)
 
 

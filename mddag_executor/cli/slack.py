@@ -84,7 +84,7 @@ def main(args: argparse.Namespace) -> int:
 def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
     from mddag_executor.whatif.reschedule import reschedule
     from mddag_executor.whatif.slack import Problem
-    options.refuse(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
+    options.reject_options(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
     source = recorded.source_of(args)
     if source.is_bag:
         raise UsageError(f'{source.name}: it has no execution times: give the declaration instead '

@@ -19,7 +19,7 @@ from mddag_executor.defaults import workers
 from mddag_executor.errors import UsageError
 from msg_graph import DurationError, load, parse_duration, TaskSet
 from msg_graph.duration import DAY
-from msg_graph.errors import did_you_mean, listed, shown
+from msg_graph.errors import did_you_mean, listed, quoted
 from msg_graph.model import MOST_WORKERS
 from rclpy.context import Context
 from rclpy.duration import Duration
@@ -54,7 +54,7 @@ def check_process(name: str | None, task_set: TaskSet | None) -> None:
     if name is not None and name not in names:
         remedy = did_you_mean(name, names, f'give one of {listed(names)}') if names else (
             "declare 'processes:', or leave it out")
-        raise UsageError(f'process {shown(name)}: the declaration has no such process: {remedy}')
+        raise UsageError(f'process {quoted(name)}: the declaration has no such process: {remedy}')
 
 
 def check_handler(handler: object) -> None:

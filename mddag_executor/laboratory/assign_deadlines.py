@@ -31,7 +31,7 @@ from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment
 from mddag_executor.laboratory.tasks import Task, tasks_of
 from msg_graph import format_duration, Path, TaskSet
-from msg_graph.duration import MICROSECOND, whole_us
+from msg_graph.duration import MICROSECOND, round_up_deadline
 from msg_graph.edit import with_deadlines
 from msg_graph.segments import ends_of, Segment, segments, sinks_after
 
@@ -94,7 +94,8 @@ def proportional(tasks: list[Task]) -> Deadlines:
     for task in tasks:
         for index, _, length in task.sinks:
             key = task.dag.vertices[index].callback.key
-            deadline = whole_us(task.period * (length / task.length if task.length else 1.0))
+            share = length / task.length if task.length else 1.0
+            deadline = round_up_deadline(task.period * share)
             deadlines[key] = min(deadline, deadlines.get(key, deadline))
     return deadlines
 

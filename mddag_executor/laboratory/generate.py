@@ -24,7 +24,7 @@ from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.shapes import draw_shape, Shape
 from mddag_executor.laboratory.shares import Dice, dirichlet_rescale
 from mddag_executor.text import counted
-from msg_graph.duration import DAY, exact_duration, whole_us
+from msg_graph.duration import DAY, exact_duration, round_up_deadline
 from msg_graph.model import MOST_WORKERS
 
 LEAST_NS = 1_000
@@ -119,7 +119,7 @@ def generate(options: Options, number: int = 0) -> str:
     dags = []
     for i, (period, shape) in enumerate(drawn):
         costs = _costs(dice, shape, round(utilisations[i] * period))
-        deadlines = [whole_us(period * dice.number(*options.tightness))
+        deadlines = [round_up_deadline(period * dice.number(*options.tightness))
                      for _ in range(shape.first_sink, shape.count)]
         dags.append(_Dag(f'dag_{i}', period, shape, costs, deadlines))
     return '\n'.join(_lines(options, number, dags)) + '\n'

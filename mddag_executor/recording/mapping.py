@@ -40,7 +40,7 @@ from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import Recording
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
-from msg_graph import Dag, NO_GRAPH, TaskSet, Vertex
+from msg_graph import Dag, EMPTY_TASK_SET, TaskSet, Vertex
 from msg_graph.binding import Binder, entities_of, Entity, suggest_entity
 import numpy as np
 
@@ -219,7 +219,7 @@ class Matching:
     def __init__(
         self, name: str, who: Entities, judge: TaskSet | None
     ) -> None:
-        self.task_set = judge or NO_GRAPH
+        self.task_set = judge or EMPTY_TASK_SET
         self.warnings: list[str] = []
         #: By number of a recorded callback.
         self.target: dict[int, Target] = {}

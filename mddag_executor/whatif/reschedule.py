@@ -31,8 +31,8 @@ from mddag_executor.sources.open import Given, open_recording, Progress, undecla
 from mddag_executor.text import counted, listed
 from mddag_executor.whatif.computed import ComputedRun
 from mddag_executor.whatif.load import LoadBuilder, RecordedLoad
-from msg_graph import NO_GRAPH, Process, TaskSet
-from msg_graph.derive import no_garbage
+from msg_graph import EMPTY_TASK_SET, Process, TaskSet
+from msg_graph.derive import gc_paused
 from msg_graph.model import MOST_WORKERS
 
 
@@ -182,7 +182,7 @@ def reschedule(
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
     run = path if isinstance(path, Recording) else open_recording(
         path, task_set, name, progress)
-    if run.task_set is NO_GRAPH:
+    if run.task_set is EMPTY_TASK_SET:
         raise undeclared(run.name)
     head, each, given = run.head, run.workers_each, policy
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
@@ -197,7 +197,7 @@ def reschedule(
         expire_after=EXPIRE_AFTER_NS)
     tables = tables_of(run.task_set)
     recorded = Replay(run, skip) if run.messages is None else None
-    with no_garbage():
+    with gc_paused():
         builder = LoadBuilder(run, tables, each, _processes(run, run.placed), times)
     give_back()
     placed = _placed(run, builder) if processes is None else processes(
@@ -214,7 +214,7 @@ def reschedule(
             'one process only: choose another with --policy')
         policy = 'fifo'
     find_policy(policy).mode(preemptive, len(placed))
-    with no_garbage():
+    with gc_paused():
         work = builder.build(overheads, tables.process, workers if workers < each else NEVER)
     if work.unknown:
         raise ReplayError(
@@ -248,7 +248,7 @@ def reschedule(
         policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
         judge_from=max(begin, judge_from), judge_until=judge_until,
         processes=max(1, len(placed)), on_late=on_late)
-    with no_garbage():
+    with gc_paused():
         return Reschedule(
             run, work, tables, settings, warnings, skip, overheads, placed, recorded)
 

@@ -46,7 +46,7 @@ from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
 from msg_graph import TaskSet
-from msg_graph.derive import no_garbage
+from msg_graph.derive import gc_paused
 import numpy as np
 
 MOST, LEAST = 100.0, 0.01
@@ -182,7 +182,7 @@ class Search:
         settings = replace(
             problem.settings, duration_ns=min(end, problem.settings.duration_ns),
             stop_at_first_miss=stop)
-        with no_garbage():
+        with gc_paused():
             return schedule(problem.tables, load, settings, compiled=self._compiled).decisions
 
     def _misses(self, load: Load, end: int, stop: bool) -> list[Miss]:
