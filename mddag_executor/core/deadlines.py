@@ -4,8 +4,9 @@
 The deadlines of open jobs, for drivers with a clock: a miss is known when it happens (rule 6).
 
 A driver asks for the next deadline, and calls ``judge`` after it.  Each slot has one entry in a
-heap, for the next deadline of its job.  A job that ends leaves its entry behind, so an entry may
-be too early for the slot's next job: it is replaced when its time has come.
+heap, for the next deadline of its job.  A job that ends leaves its entry behind.  It is removed
+when it comes first while the slot is free (``first``); else it may be too early for the slot's
+next job, and is replaced when its time has come.
 """
 
 from __future__ import annotations
@@ -53,6 +54,16 @@ class Deadlines:
                 self._judged[slot] = now - 1
                 self._add(slot, now - 1)
         self.next = heap[0][0] if heap else NEVER
+
+    def first(self) -> int:
+        """Return ``next``, after the entries of ended jobs that come first were removed."""
+        heap, states = self._heap, self._state.job_state
+        while heap and states[heap[0][1]] != OPEN:
+            time, slot = heappop(heap)
+            if self._entry.get(slot) == time:
+                del self._entry[slot]
+            self.next = heap[0][0] if heap else NEVER
+        return self.next
 
     def broken_invariants(self) -> Iterator[str]:
         """Yield a sentence for each invariant that does not hold; for debugging."""

@@ -20,10 +20,11 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.executor import compat
+from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
 from mddag_executor.executor.sources import Source
-from mddag_executor.executor.timers import TimerQueue, TimerSource
+from mddag_executor.executor.timers import Fired, TimerQueue, TimerSource
 from mddag_executor.executor.workers import WorkerPool
 
 
@@ -36,7 +37,10 @@ class AtOnce:
 
     def __init__(self, pool: WorkerPool) -> None:
         self.loop = EventLoop()
-        self.timers = TimerQueue(self.loop.wake, pool.fail)
+        self.agenda = Agenda()
+        self._fired: list[Fired] = []
+        self.timers = TimerQueue(
+            self.agenda, self._fired.append, self.loop.wake, pool.fail)
         self.pool = pool
         self.has_run = False
 
@@ -53,14 +57,20 @@ class AtOnce:
         if self.timers.has_jumped or self.loop.timer.at <= monotonic_ns():
             self.loop.timer.at = NEVER
             with self.pool.lock:
-                fired = list(self.timers.fire())
+                if self.timers.has_jumped:
+                    self.timers.ask_after_jump()
+                last = self.agenda.last
+                while self.agenda.handle_next(monotonic_ns(), last):
+                    pass
+            fired = self._fired[:]
+            self._fired.clear()
             for work, *_ in fired:
                 if compat.ends_sleep(work.function):
                     work.function(*work.args)
                     self.count(work.entity)
                 else:  # it had no callback at first, and is not that of a Rate
                     self.pool.post([work])
-        due = self.timers.next_due()
+        due = self.agenda.first()
         if due != self.loop.timer.at:
             self.loop.timer.arm(due)
         return self.has_run

@@ -21,12 +21,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from heapq import heappop, heappush
 from time import monotonic_ns, process_time_ns
 from typing import Any, Protocol
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.core import NEVER
+from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     GUARD_NS,
@@ -59,16 +59,15 @@ class Clocked(Protocol):
     clock: TraceClock
     loop: EventLoop
     parking: Parking
+    agenda: Agenda
     timers: TimerQueue
     deferred: deque[Callable[[], None]]
+    now: int
     running: bool
     is_stepping: bool
     polling: int
     context: Any
     wake_executor: Callable[[], None]
-
-    def fire_timers(self) -> None:
-        """Report the due timers to the engine."""
 
     def log_misses(self) -> None:
         """Log misses, soon."""
@@ -90,6 +89,27 @@ class Clocked(Protocol):
         """Return the thread that runs an execution."""
 
 
+class Call:
+    """A call at a time, which waits until the lock is free."""
+
+    def __init__(self, deferred: deque[Callable[[], None]], function: Callable[[], None]) -> None:
+        self.entry: list[Any] | None = None
+        self._deferred = deferred
+        self._function = function
+
+    def come_due(self) -> None:
+        """Let the function be called."""
+        self._deferred.append(self._function)
+
+
+class Appointed:
+    """A method of due times that is called at a time, with the lock."""
+
+    def __init__(self, act: Callable[[], None]) -> None:
+        self.entry: list[Any] | None = None
+        self.come_due = act
+
+
 class DueTimes:
     """
     The times at which a worker pool has to act; all methods need the engine's lock.
@@ -102,19 +122,17 @@ class DueTimes:
         self._engine = pool.engine
         self._timer = pool.loop.timer
         self._watch = pool.parking.watch
+        self._agenda = pool.agenda
         self._timers = pool.timers
         self._timers.allowance = self.allowance
         # how long an arrival from outside may stay unnoticed while a callback computes
         self._allowance = NEVER
         self._offset = pool.clock.offset_ns
         self._check_context_at = 0
-        self._calls: list[tuple[int, int, Callable[[], None]]] = []
-        self._n_calls = 0
         self._gil_check = GilCheck()
-        # the next deadline, on the trace's clock, when the timerfd was set
-        self.deadline = NEVER
-        #: whether the timerfd may be set to a time at which nothing is due
-        self.may_expire_early = False
+        # the next deadline of a job that is in the agenda, on the trace's clock
+        self._deadline = NEVER
+        self._overdue = Appointed(self._judge_overdue)
         self._seen = monotonic_ns(), process_time_ns()
 
     def begin(self, now: int) -> None:
@@ -124,8 +142,7 @@ class DueTimes:
 
     def call_at(self, at: int, function: Callable[[], None]) -> None:
         """Call a function at a time, without the lock."""
-        self._n_calls += 1
-        heappush(self._calls, (at, self._n_calls, function))
+        self._agenda.set(Call(self._pool.deferred, function), at, at)
         self.arm_by(at)
 
     def handle(self, now: int, since: int) -> None:
@@ -136,62 +153,69 @@ class DueTimes:
         :param since: since when the calling thread has waited in the epoll, on the trace's clock;
             or now.
         """
-        pool, monotonic = self._pool, now - self._offset
+        pool, agenda, monotonic = self._pool, self._agenda, now - self._offset
         self._notice_stop(monotonic, since)
         if monotonic > self._check_context_at:  # a context that was only destroyed is not reported
             self._check_context_at = monotonic + 20 * AGAIN_NS
             if is_over(pool.context):
                 pool.wake_executor()
         self._timer.at = NEVER
-        pool.fire_timers()
-        if now > self._engine.deadlines.next:
-            self._engine.judge_overdue(now)
+        if self._timers.has_jumped:
+            self._timers.ask_after_jump()
+        last = agenda.last
+        while agenda.handle_next(monotonic_ns(), last):
+            pass
         if self._gil_check.at <= monotonic:
             self._check_gil(monotonic)
-        while self._calls and self._calls[0][0] <= monotonic:
-            pool.deferred.append(heappop(self._calls)[2])
         pool.log_misses()
 
     def is_due(self, now: int) -> bool:
         """Return whether there is anything to ``handle``."""
-        timers = self._timers
-        return (timers.has_jumped or timers.next_due() <= now or self._gil_check.at <= now
-                or self._engine.deadlines.next < now + self._offset
-                or bool(self._calls) and self._calls[0][0] <= now)
+        return (self._agenda.first() <= now or self._timer.at <= now
+                or self._gil_check.at <= now or self._timers.has_jumped)
+
+    def note_deadline(self) -> None:
+        """Note the next deadline of a job."""
+        deadline = self._engine.next_deadline()
+        if deadline == self._deadline:
+            return
+        self._deadline = deadline
+        if deadline == NEVER:
+            self._agenda.cancel(self._overdue)
+        else:  # a miss need not be reported at once while callbacks compute
+            at = deadline - self._offset
+            self._agenda.set(self._overdue, at + 1, at + NET_NS)
+
+    def _judge_overdue(self) -> None:
+        self._deadline = NEVER
+        self._engine.judge_overdue(self._pool.now)
 
     def arm(self, now: int) -> None:
         """Set the time at which a thread wakes up: one in the epoll, else a parked one."""
-        pool, engine = self._pool, self._engine
-        self._timers.has_new = False
+        pool = self._pool
         if not pool.polling and not pool.is_stepping:
             self._timer.at = NEVER  # it may expire: nobody is woken
             if pool.running and pool.is_busy():
                 self.look(now)
             return
-        self.deadline = engine.deadlines.next
         if not pool.running:
             self._timer.arm(NEVER)
             return
-        first, timer = self._first(now, bool(engine.holders))
-        self.may_expire_early = first != timer
+        first = self._first(now, bool(self._engine.holders))
         if first != self._timer.at:
             self._timer.arm(first)
 
-    def _first(self, now: int, looks: bool) -> tuple[int, int]:
-        """Return the next due time, or that of a look, and the same of timers only."""
+    def _first(self, now: int, looks: bool) -> int:
+        """Return the next due time, or that of a look."""
         engine, check = self._engine, self._gil_check
-        timer = self._timers.next_look() if looks else self._timers.next_due()
-        first = timer
-        if self.deadline < NEVER:  # a miss need not be reported at once while callbacks compute
-            first = min(first, self.deadline - self._offset + (NET_NS if looks else 1))
-        if self._calls:
-            first = min(first, self._calls[0][0])
+        self.note_deadline()
+        first = self._agenda.first_latest() if looks else self._agenda.first()
         if engine.holders and engine.has_waiting:
             self._watch_holder(now)
             first = min(first, self._next_check(now))
         elif check.at < NEVER:
             check.end()
-        return first, timer
+        return first
 
     # --- looks -----------------------------------------------------------------------------------
 
@@ -210,15 +234,14 @@ class DueTimes:
 
     def look(self, now: int) -> None:
         """Set the time of the next look while callbacks run and no thread waits for events."""
-        self.deadline = self._engine.deadlines.next
-        at = min(self._first(now, True)[0], now + self._allowance)
+        at = min(self._first(now, True), now + self._allowance)
         if at != self._watch.at:
             self._watch.arm(at)
 
     def look_after(self, now: int) -> None:
         """Set the time of a look in case that a short callback runs longer than expected."""
         watch = self._watch
-        at = min(self._timers.next_look(), now + (
+        at = min(self._agenda.first_latest(), now + (
             self._engine.patience() if self._engine.has_waiting else NET_NS))
         if at < watch.at or watch.at < now + GUARD_NS:
             watch.arm(at)
@@ -264,7 +287,6 @@ class DueTimes:
         """Let a thread wake up at a time, unless it does sooner."""
         if self._pool.polling or self._pool.is_stepping:
             if at < self._timer.at:
-                self.may_expire_early = True
                 self._timer.arm(at)
         elif at < self._watch.at:
             self._watch.arm(at)

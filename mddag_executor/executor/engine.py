@@ -961,6 +961,10 @@ class Engine:
         return {} if self.path_watch is None else self.path_watch.result(
             min(now, self._ended), self._state.scalars[JUDGE_FROM])
 
+    def next_deadline(self) -> int:
+        """Return a time at or before the next deadline of an open job; NEVER: there is none."""
+        return self.deadlines.first()
+
     def judge_overdue(self, now: int) -> None:
         """Report the sinks whose deadlines are over and which have not completed."""
         if self._finished:

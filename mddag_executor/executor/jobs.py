@@ -32,6 +32,7 @@ from time import time_ns
 from typing import Any, NamedTuple
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import MOST, REMEMBERED
 from msg_graph import TaskSet
 
@@ -41,7 +42,6 @@ ROUNDING_NS = 2
 MANY_UNLIKE = 4
 """After so many publications in a row the numbers of a publisher are known to have shifted."""
 
-_STILL_PUBLISHING = 2 ** 63 - 1
 NO_NUMBER = -(2 ** 62)
 """The count of a publication made by a signal handler within another one of its publisher."""
 
@@ -176,7 +176,7 @@ class Publication:
 
     def __init__(
         self, begin: int, numbers: PublisherNumbers, origin: Origin | Announced, sequence: int,
-        end: int = _STILL_PUBLISHING,
+        end: int = NEVER,
     ) -> None:
         self.begin = begin
         self.end = end

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Due times of timers: a heap behind the timerfd, instead of an rcl wait set.
+When timers are due: appointments in the agenda, instead of an rcl wait set.
 
 Theory of operation
 -------------------
@@ -20,15 +20,13 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from heapq import heapify, heappop, heappush
 import time
 from typing import Any
-import weakref
 
 from mddag_executor.clocks import epoch_offset_ns
-from mddag_executor.core import NEVER
+from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.compat import RCL_ERRORS, timer_functions, with_timer_info
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.listeners import NextCall
@@ -61,7 +59,7 @@ class TimerSource(EntitySource):
 
     Its listener announces that it is reset.
 
-    :ivar due: when to ask rcl next (monotonic ns), while ``entry`` is its entry's number, not 0.
+    :ivar due: when to ask rcl next (monotonic ns), while its entry in the agenda is not empty.
     """
 
     def __init__(self, entity: Entity, queue: TimerQueue) -> None:
@@ -77,7 +75,7 @@ class TimerSource(EntitySource):
         self._offset = 0
         self.last_period = timer.timer_period_ns
         self.due = 0
-        self.entry = 0
+        self.entry: list[Any] | None = None
         self.simulated = False
 
     def listen(self) -> None:
@@ -94,6 +92,10 @@ class TimerSource(EntitySource):
         """Ask rcl when it is due, as it was reset."""
         if self.fd >= 0:  # else it was removed after its arrival was found
             self._queue.ask(self)
+
+    def come_due(self) -> None:
+        """Fire, if rcl agrees."""
+        self._queue.fire(self)
 
     def next_due(self) -> int | None:
         """Return the time of its next call by rcl, monotonic ns; None while it is cancelled."""
@@ -126,29 +128,29 @@ class TimerSource(EntitySource):
 
 class TimerQueue:
     """
-    Timers by due time; all methods need one lock.
+    The timers whose due times are in an agenda; all methods need one lock.
 
-    :param on_change: called, from any thread, when the clock of a timer has jumped, or a timer is
-        due earlier: call ``fire`` soon.
+    :param agenda: it has an appointment for each timer.
+    :param report: receives each timer that has fired.
+    :param on_change: called, from any thread, when the clock of a timer has jumped: call
+        ``ask_after_jump`` soon.
     :param on_error: receives errors of rcl.
-    :ivar has_new: whether there are new due times since it was set to False.
-    :ivar has_jumped: whether the clock of a timer has jumped since ``fire``.
+    :ivar has_jumped: whether the clock of a timer has jumped since ``ask_after_jump``.
     """
 
     def __init__(
-        self, on_change: Callable[[], None], on_error: Callable[[BaseException], None]
+        self, agenda: Agenda, report: Callable[[Fired], None], on_change: Callable[[], None],
+        on_error: Callable[[BaseException], None],
     ) -> None:
+        self._agenda = agenda
+        self._report = report
         self._on_change = on_change
         self._on_error = on_error
         self._timers: dict[int, TimerSource] = {}
-        self._heap: list[tuple[int, int, TimerSource]] = []
-        # the same by the time at which each may be noticed at the latest
-        self._looks: list[tuple[int, int, weakref.ref[TimerSource]]] = []
         #: returns how long a timer with a period may stay unnoticed while a callback computes
         self.allowance: Callable[[Entity, int], int] = lambda *_: 0
-        self._entries = 0
         self._jumps: dict[int, tuple[Clock, JumpHandle]] = {}
-        self.has_jumped = self.has_new = False
+        self.has_jumped = False
 
     # --- timers --- ------------------------------------------------------------------------------
 
@@ -162,7 +164,7 @@ class TimerQueue:
     def remove(self, source: TimerSource) -> None:
         """Remove a timer."""
         self._timers.pop(id(source), None)
-        source.entry = 0
+        self._agenda.cancel(source)
         clock = source.timer.clock
         if source.may_be_simulated and all(
                 each.timer.clock is not clock for each in self._timers.values()):
@@ -198,26 +200,7 @@ class TimerQueue:
         for source in list(self._timers.values()):
             self.remove(source)
 
-    # --- time ------------------------------------------------------------------------------------
-
-    def next_due(self) -> int:
-        """Return when to ``fire`` next (monotonic ns); NEVER: there are no timers."""
-        heap = self._heap
-        while heap and heap[0][2].entry != heap[0][1]:
-            heappop(heap)
-        return heap[0][0] if heap else NEVER
-
-    def next_look(self) -> int:
-        """Return when to ``fire`` at the latest while a callback computes (monotonic ns)."""
-        looks = self._looks
-        while looks and not self._is_valid(looks[0]):
-            heappop(looks)
-        return looks[0][0] if looks else NEVER
-
-    @staticmethod
-    def _is_valid(look: tuple[int, int, weakref.ref[TimerSource]]) -> bool:
-        source = look[2]()
-        return source is not None and source.entry == look[1]
+    # --- due times -------------------------------------------------------------------------------
 
     def ask(self, source: TimerSource) -> None:
         """Ask rcl when a timer is due that is new or was reset."""
@@ -230,61 +213,44 @@ class TimerQueue:
     def _ask(self, source: TimerSource) -> None:
         source.simulated = source.is_simulated()
         if source.simulated:
-            source.entry = 0
+            self._agenda.cancel(source)
             if source.is_due():
                 self._push(source, _now())
             return
         due = source.next_due()
         if due is None:
-            source.entry = 0
+            self._agenda.cancel(source)
         elif not source.entry or due != source.due:
             self._push(source, due)
 
     def _push(self, source: TimerSource, due: int) -> None:
-        self._entries += 1
-        source.due, source.entry = due, self._entries
-        heappush(self._heap, (due, self._entries, source))
-        heappush(self._looks, (
-            due + self.allowance(source.entity, source.last_period), self._entries,
-            weakref.ref(source)))
-        self.has_new = True
-        most = 2 * len(self._timers) + 8  # more after many resets
-        if len(self._heap) > most:
-            self._heap = [each for each in self._heap if each[2].entry == each[1]]
-            heapify(self._heap)
-        if len(self._looks) > most:
-            self._looks = [each for each in self._looks if self._is_valid(each)]
-            heapify(self._looks)
+        source.due = due
+        self._agenda.set(source, due, due + self.allowance(source.entity, source.last_period))
 
-    def fire(self) -> Iterator[Fired]:
-        """Yield the due timers, each once, including those that become due meanwhile."""
-        if self.has_jumped:
-            self.has_jumped = False
-            for source in list(self._timers.values()):
-                if source.may_be_simulated:
-                    self.ask(source)
-        heap = self._heap
-        last = self._entries  # an entry made meanwhile is of the next round
-        while heap and heap[0][1] <= last and heap[0][0] <= _now():
-            _, entry, source = heappop(heap)
-            if source.entry != entry:
-                continue
-            source.entry = 0
-            try:
-                with source.handle:
-                    fired = self._fire(source)
-            except RCL_ERRORS as error:
-                self._failed(source, error)
-                continue
-            if fired is not None:
-                yield fired
+    def ask_after_jump(self) -> None:
+        """Ask rcl about all timers whose clocks may have jumped."""
+        self.has_jumped = False
+        for source in list(self._timers.values()):
+            if source.may_be_simulated:
+                self.ask(source)
+
+    def fire(self, source: TimerSource) -> None:
+        """Report a timer that is due, if rcl agrees, and set its next due time."""
+        try:
+            with source.handle:
+                fired = self._fire(source)
+        except RCL_ERRORS as error:
+            self._failed(source, error)
+            return
+        if fired is not None:
+            self._report(fired)
 
     def _fire(self, source: TimerSource) -> Fired | None:
         """Call a timer if rcl reports it due, and push its next due time."""
         if source.entity.waiting and source.period() <= 0:
             source.entity.collect_more = partial(self._fire_again, source)
             return None
-        if source.simulated:  # since the last jump of its clock, which ``fire`` checks first
+        if source.simulated:  # since the last jump of its clock, which is handled first
             return self._fire_simulated(source)
         due, now, until = source.due, _now(), source.until()
         if until is None:
@@ -324,11 +290,10 @@ class TimerQueue:
         """Continue with a timer without a period, as its execution has started."""
         if id(source) in self._timers and not source.entry:
             self._push(source, _now() + ZERO_PERIOD_NS)
-            self._on_change()
 
     def _failed(self, source: TimerSource, error: Exception) -> None:
         """Classify an exception of rcl: the timer is destroyed or cancelled, or it is an error."""
-        source.entry = 0
+        self._agenda.cancel(source)
         try:
             with source.handle:  # keeps rcl's memory valid
                 is_cancelled = source.next_due() is None

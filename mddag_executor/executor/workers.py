@@ -51,8 +51,8 @@ from typing import Any, TYPE_CHECKING
 import weakref
 
 from mddag_executor.clocks import TraceClock
-from mddag_executor.core.tables import NEVER
 from mddag_executor.errors import from_user_code
+from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     ALONE_NS,
@@ -75,7 +75,7 @@ from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.pausing import can_pause, Pause
 from mddag_executor.executor.shutdown import is_over
-from mddag_executor.executor.timers import TimerQueue
+from mddag_executor.executor.timers import Fired, TimerQueue
 from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Destroyed, Refused, Work
 from mddag_executor.trace.groups import PUBLICATION
@@ -104,7 +104,11 @@ class ThreadState(Enum):
           WAITING ◀──────────────────────────────────────────┴─┘ nothing to run
 
     A thread of the pool begins and ends as PARKED, that of ``spin_once`` as RUNNING.
+
+    :ivar next: the states that may follow; a thread that stays in one does not change.
     """
+
+    next: tuple[ThreadState, ...]
 
     PARKED = 'parked'       # waits to be called, or for the time of a look
     WAITING = 'waiting'     # waits for events
@@ -112,19 +116,24 @@ class ThreadState(Enum):
     OUT = 'out'             # runs one that has lent its worker, and waits or waits for its turn
 
 
-_NEXT = {
-    ThreadState.PARKED: {ThreadState.WAITING, ThreadState.RUNNING},
-    ThreadState.WAITING: {ThreadState.PARKED, ThreadState.RUNNING},
-    ThreadState.RUNNING: {ThreadState.PARKED, ThreadState.WAITING, ThreadState.OUT},
-    ThreadState.OUT: {ThreadState.RUNNING, ThreadState.PARKED, ThreadState.WAITING},
-}
-"""Which states may follow; a thread that stays in one does not change."""
+for _state, _next in (
+    (ThreadState.PARKED, (ThreadState.WAITING, ThreadState.RUNNING)),
+    (ThreadState.WAITING, (ThreadState.PARKED, ThreadState.RUNNING)),
+    (ThreadState.RUNNING, (ThreadState.PARKED, ThreadState.WAITING, ThreadState.OUT)),
+    (ThreadState.OUT, (ThreadState.RUNNING, ThreadState.PARKED, ThreadState.WAITING)),
+):
+    _state.next = _next
+
+
+# module globals are quicker to read than members of the enum
+_PARKED, _WAITING, _RUNNING = ThreadState.PARKED, ThreadState.WAITING, ThreadState.RUNNING
 
 
 class WorkerThread:
     """
     A thread that runs callbacks.
 
+    :ivar name: its name, in what an ``InvariantError`` tells.
     :ivar work: the running execution.
     :ivar worker: the number of its last worker in the core.
     :ivar state: what it does; only the pool changes it.
@@ -145,12 +154,13 @@ class WorkerThread:
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
                  'state', 'is_spare', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
-                 'waits_since', 'is_out', 'measurement', 'pause', 'paused_ns')
+                 'waits_since', 'is_out', 'measurement', 'pause', 'paused_ns', 'name')
 
     def __init__(self, pool: WorkerPool, thread: threading.Thread | None) -> None:
         self.pool = pool
         self.engine = pool.engine
         self.thread = thread
+        self.name = 'visitor'
         self.work: Work | None = None
         self.worker = 0
         self.permit = threading.Lock()
@@ -243,13 +253,14 @@ class WorkerPool:
         # reentrant only to know its owner: a signal handler may run inside
         self.lock = engine_lock(self._validate, engine.size)
         # the last changes of threads: time, name, and new state
-        self._history = deque([(0, '', '')] * HISTORY, HISTORY)
+        self._history: deque[tuple[int, str, ThreadState]] = deque(maxlen=HISTORY)
         #: functions to call when the calling thread does not own the lock
         self.deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.parking = Parking()
         self.announcements: Announced | None = None
-        self.timers = TimerQueue(self.loop.wake, fail)
+        self.agenda = Agenda()
+        self.timers = TimerQueue(self.agenda, self._timer_fired, self.loop.wake, fail)
         self.running = False
         self.stopped_at = 0
         self.is_current = False
@@ -326,13 +337,13 @@ class WorkerPool:
         now = self.now = monotonic_ns() + self._offset
         return now
 
-    def fire_timers(self) -> None:
-        """Report the due timers to the engine; the caller holds the lock."""
-        for work, due, missed, period in self.timers.fire():
-            due += self._offset
-            self.engine.timer_due(work, due, self.now)
-            if missed:
-                self.engine.timer_missed(work.entity, due, period, missed, self.now)
+    def _timer_fired(self, fired: Fired) -> None:
+        """Report a timer that is due to the engine; the caller holds the lock."""
+        work, due, missed, period = fired
+        due += self._offset
+        self.engine.timer_due(work, due, self.now)
+        if missed:
+            self.engine.timer_missed(work.entity, due, period, missed, self.now)
 
     def report(self, event: Callable[..., None], *args: Any) -> None:
         """Report an event to a method of the engine, and wake a thread for ready executions."""
@@ -533,8 +544,8 @@ class WorkerPool:
         me = WorkerThread(self, None)
         me.state = ThreadState.PARKED
         me.worker = len(self._threads) % self.engine.n_workers
-        me.thread = threading.Thread(
-            target=self._run, args=(me,), daemon=True, name=f'mddag-worker-{len(self._threads)}')
+        me.name = f'mddag-worker-{len(self._threads)}'
+        me.thread = threading.Thread(target=self._run, args=(me,), daemon=True, name=me.name)
         self._threads.append(me)
         self._n_parked += 1
         try:
@@ -593,29 +604,31 @@ class WorkerPool:
             raise InvariantError([*error.broken, *self._story()]) from None
 
     def _story(self) -> list[str]:
-        return [f'{(at - self.now) / 1e6:+.3f} ms {name} {state}'
-                for at, name, state in self._history if name]
+        return [f'{(at - self.now) / 1e6:+.3f} ms {name} {state.value}'
+                for at, name, state in self._history]
 
     def _become(self, me: WorkerThread, state: ThreadState) -> None:
         """Change the state of a thread; the caller holds the lock."""
         before = me.state
         if before is state:
             return
-        if state not in _NEXT[before]:
+        if state not in before.next:
             raise InvariantError(
                 [f'a thread that was {before.value} is {state.value}', *self._story()])
         me.state = state
-        name = 'visitor' if me.thread is None else me.thread.name
-        self._history.append((self.now, name, state.value))
-        if me.thread is not None:
-            self._n_parked += (state is ThreadState.PARKED) - (before is ThreadState.PARKED)
-        if state is ThreadState.WAITING:
+        self._history.append((self.now, me.name, state))
+        if state is _WAITING:
             self.polling += 1
             me.waits_since = self.now
-        elif before is ThreadState.WAITING:
+        elif before is _WAITING:
             self.polling -= 1
             if self._leaving and not self.polling:
                 self._all_left.set()
+        if me.thread is not None:
+            if state is _PARKED:
+                self._n_parked += 1
+            elif before is _PARKED:
+                self._n_parked -= 1
 
     # --- a turn ----------------------------------------------------------------------------------
 
@@ -658,9 +671,8 @@ class WorkerPool:
                 source.collect()
             else:
                 self.loop.announce(source)  # for the next spin
-        now = self.now - self._offset      # a recorded message is later than the turn began
-        if self.running and (self.timers.has_new or self.loop.timer.at <= now
-                             or self.due.is_due(now)):
+        # a recorded message is later than the turn began
+        if self.running and self.due.is_due(self.now - self._offset):
             self.due.handle(self.now, since)
 
     def _look(self, now: int) -> None:
@@ -763,9 +775,10 @@ class WorkerPool:
         elif self.polling:
             if engine.may_start_more(now):
                 self._call()
-            elif (self.timers.has_new or self.loop.timer.at == NEVER
-                    or engine.deadlines.next < due.deadline):
-                due.arm(now - self._offset)
+            else:
+                due.note_deadline()
+                if self.agenda.first() < self.loop.timer.at:
+                    due.arm(now - self._offset)
         elif engine.idle_workers:
             if is_short:
                 due.look_after(now - self._offset)

@@ -336,6 +336,9 @@ class LiveDriver(RuleBasedStateMachine):
         self.overdue |= passed  # a sink that may still not be due then is judged when it ends
         later = [deadline for deadline in due.values() if deadline >= self.now]
         assert self.now <= self.deadlines.next <= min(later, default=NEVER)
+        if self.deadlines.first() < NEVER:  # what comes first is of a slot in use
+            assert OPEN in self.state.job_state
+        assert self.now <= self.deadlines.first() <= min(later, default=NEVER)
         assert not [*self.deadlines.broken_invariants()]
 
     def due(self):

@@ -8,7 +8,10 @@ import threading
 import time
 
 from builtin_interfaces.msg import Time as TimeMessage
+from hypothesis import given
+from hypothesis import strategies as st
 from mddag_executor.core import NEVER
+from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.listeners import TimerFd
 from msg_graph import loads
 import pytest
@@ -19,6 +22,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Header
 
+from ..conftest import examples
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import graph
 
@@ -28,7 +32,56 @@ MS = 1_000_000
 def waits_for_no_timer(executor):
     """Tell whether the executor knows of all timers, and none is to become due."""
     with executor._pool.lock:
-        return executor._pool.is_current and executor._pool.timers.next_due() == NEVER
+        return executor._pool.is_current and executor._pool.agenda.first() == NEVER
+
+
+class Appointed:
+    """An appointment that notes when it has come due."""
+
+    def __init__(self, come):
+        self.entry = None
+        self.come_due = lambda: come.append(self)
+
+
+@examples(100)
+@given(st.lists(st.tuples(
+    st.sampled_from(('set', 'set', 'cancel', 'handle')), st.integers(0, 4), st.integers(0, 30),
+    st.integers(0, 9)), max_size=60))
+def test_each_appointment_comes_due_once_in_order_and_what_was_changed_leaves_nothing(steps):
+    agenda, come, expected, now = Agenda(), [], {}, 0
+    several = [Appointed(come) for _ in range(5)]
+    for what, which, time_, more in steps:
+        one = several[which]
+        if what == 'set':
+            agenda.set(one, now + time_, now + time_ + more)
+            expected[one] = now + time_, now + time_ + more
+        elif what == 'cancel':
+            agenda.cancel(one)
+            expected.pop(one, None)
+        else:
+            now += time_
+            while agenda.handle_next(now, agenda.last):
+                at = expected.pop(come[-1])[0]
+                assert at <= now and at <= min((each[0] for each in expected.values()), default=at)
+        assert agenda.first() == min((each[0] for each in expected.values()), default=NEVER)
+        assert agenda.first_latest() == min((each[1] for each in expected.values()), default=NEVER)
+        assert len(agenda._heap) <= 2 * len(expected) + 8
+    assert not agenda.handle_next(NEVER, 0)
+
+
+def test_the_deadline_of_a_job_that_was_in_time_wakes_no_thread(make_executor, make_node):
+    node, ran = make_node('n'), []
+    node.create_subscription(Header, '/go', ran.append, 10)
+    go = node.create_publisher(Header, '/go', 10)
+    executor = make_executor(loads(graph(
+        n='name: on, subscription: /go, dag: once, period: 600s, deadline: 300s')), nodes=[node])
+    with Spinning(executor):
+        assert wait_for(lambda: waits_for_no_timer(executor))
+        matched(go)
+        go.publish(Header())
+        assert wait_for(lambda: ran)
+        assert wait_for(lambda: executor.statistics()['dags']['once']['ends']['completed'])
+        assert wait_for(lambda: executor._pool.polling and waits_for_no_timer(executor))
 
 
 def test_a_timer_that_was_cancelled_runs_when_it_is_reset(make_executor, make_node, spinning):
@@ -59,7 +112,7 @@ def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
     executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(resets) >= 50)
-        assert len(executor._pool.timers._heap) < 50
+        assert len(executor._pool.agenda._heap) < 50
     assert not barked
 
 
@@ -74,11 +127,11 @@ def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
     place = executor._at_once if sleeps else executor._pool
     (source,) = place.timers._timers.values()
     arrived = list(place.loop.sources(place.loop.wait(0)))
-    assert source in arrived and place.timers.next_due() < NEVER
+    assert source in arrived and place.agenda.first() < NEVER
     other.add_node(node)
     for each in arrived:
         each.collect()
-    assert place.timers.next_due() == NEVER
+    assert place.agenda.first() == NEVER
     del kept
 
 

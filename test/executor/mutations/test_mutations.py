@@ -210,7 +210,8 @@ self.due.has_looked(now - self._offset)
         'executor/executor.py', 'if added:\n            self.wake()', 'if added:\n            pass'
         )], of('test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
     Case('release_is_when_noticed', [(
-        'executor/timers.py', 'yield fired', 'yield (fired[0], _now(), *fired[2:])')], of(
+        'executor/timers.py', 'self._report(fired)',
+        'self._report((fired[0], _now(), *fired[2:]))')], of(
         'test_deadlines.py',
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('messages_go_to_the_oldest_open_job', [(

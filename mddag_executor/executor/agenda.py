@@ -1,0 +1,107 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Everything that has to be done at a time: timers, deadlines, checks and calls.
+
+All times are monotonic ns; ``NEVER`` stands for no time.
+"""
+
+from __future__ import annotations
+
+from heapq import heapify, heappop, heappush
+from typing import Any, Protocol
+
+from mddag_executor.core import NEVER
+
+
+class Appointment(Protocol):
+    """
+    Something that is done at a time, and may be set for another time before that.
+
+    :ivar entry: belongs to the agenda; None at first.
+    """
+
+    entry: list[Any] | None
+
+    def come_due(self) -> None:
+        """Do it."""
+
+
+class Agenda:
+    """
+    A heap of appointments by the time at which each is due, and the same by its latest time.
+
+    While a thread waits for events, it wakes up for each appointment when it is due.  While a
+    callback computes, no thread waits, and it is enough to notice each until its latest time.  All
+    methods need one lock.
+    """
+
+    def __init__(self) -> None:
+        # an appointment that is cancelled empties its entry, which both heaps refer to
+        self._heap: list[tuple[int, int, list[Any]]] = []
+        self._latest: list[tuple[int, int, list[Any]]] = []
+        self._entries = 0
+        self._appointments = 0
+
+    def set(self, appointment: Appointment, at: int, latest: int) -> None:
+        """Set an appointment, which may be set already, for a time."""
+        if appointment.entry:
+            appointment.entry.clear()
+        else:
+            self._appointments += 1
+        number = self._entries = self._entries + 1
+        entry = appointment.entry = [appointment]
+        heappush(self._heap, (at, number, entry))
+        heappush(self._latest, (latest, number, entry))
+        most = 2 * self._appointments + 8   # more after many changes
+        if len(self._heap) > most:
+            self._heap = _without_cancelled(self._heap)
+        if len(self._latest) > most:
+            self._latest = _without_cancelled(self._latest)
+
+    def cancel(self, appointment: Appointment) -> None:
+        """Cancel an appointment, if it is set."""
+        if appointment.entry:
+            appointment.entry.clear()
+            self._appointments -= 1
+
+    def first(self) -> int:
+        """Return when the next appointment is due."""
+        heap = self._heap
+        while heap and not heap[0][2]:
+            heappop(heap)
+        return heap[0][0] if heap else NEVER
+
+    def first_latest(self) -> int:
+        """Return until when the next appointment must be noticed."""
+        heap = self._latest
+        while heap and not heap[0][2]:
+            heappop(heap)
+        return heap[0][0] if heap else NEVER
+
+    @property
+    def last(self) -> int:
+        """Return the number of the last entry, for ``handle_next``."""
+        return self._entries
+
+    def handle_next(self, now: int, last: int) -> bool:
+        """
+        Let the next appointment come due, if it is due now; return whether there was one.
+
+        :param last: what was set after this entry counts as not due yet.
+        """
+        heap = self._heap
+        while heap and heap[0][0] <= now and heap[0][1] <= last:
+            _, _, entry = heappop(heap)
+            if entry:
+                appointment: Appointment = entry.pop()
+                self._appointments -= 1
+                appointment.come_due()
+                return True
+        return False
+
+
+def _without_cancelled(heap: list[tuple[int, int, list[Any]]]) -> list[tuple[int, int, list[Any]]]:
+    rest = [each for each in heap if each[2]]
+    heapify(rest)
+    return rest
