@@ -125,6 +125,7 @@ class Replay:
             'worker_use': self.usage.workers(head.workers),
             'dropped': dict(sorted(recording.dropped.items())),
             'messages_lost': recording.messages_lost,
+            **({'guessed': guessed} if (guessed := recording.guessed) else {}),
             'misses': self.explanation.summary(),
             'paths': paths, **({'requirements': requirements} if requirements else {}),
             **({} if not recording.imported else {

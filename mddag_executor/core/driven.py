@@ -8,8 +8,13 @@ Theory of operation
 A *driving message* is one of the topic of ``driven_by``; it belongs to a job.
 
 1.  A job *awaits* an answer from the start of the execution for its driving message on.
-2.  Each execution of the sync, for a message of any of its topics, may answer the newest job of
-    which the driving message was received before it started.
+2.  Each execution of the sync may answer one job.  The execution for a driving message may answer
+    the job of that message.  An execution for a message of another topic may answer the job whose
+    driving message has the header stamp that the output carries: programs copy the header of
+    the data that they have used.  If the output carries no stamp of a driving message, it is the
+    newest job of which the driving message was received before the execution started.  If others
+    await an answer then, this is a *guess*.  An output with the stamp of a job that has been
+    answered before answers none.
 3.  It *answers* if it publishes one of the callback's topics.  If the callback need not publish
     any (no ``publishes:``), it also answers as soon as there has been a message of each topic.
 4.  An answer completes the vertex in its job, and in all jobs whose driving messages were received
@@ -22,12 +27,13 @@ callback may be several vertices.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Set
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from msg_graph import Callback
 
+ANSWERED, GUESSED = 0, 1
+"""The leg, in recordings, of an execution that answers a job; whether it is a guess."""
 MOST_AWAITING = 1000
 """So many jobs may await an answer; of more, the oldest are forgotten."""
 
@@ -50,27 +56,66 @@ class Awaiting(Generic[JobType]):
         self._topics = frozenset(callback.publishes)
         self._must_publish = len(callback.may_publish) < len(callback.publishes)
         self._missing = set(callback.topics)
-        self._jobs: deque[JobType] = deque(maxlen=MOST_AWAITING)
+        self._jobs: dict[JobType, None] = {}
+        # those of which an output has carried the stamp of the driving message
+        self._named: dict[JobType, None] = {}
+        # by header stamp of a driving message its job, also if it has been answered
+        self._stamped: dict[int, JobType] = {}
 
     def hear(self, topic: str) -> None:
         """Note that an execution for a message of a topic starts."""
         self._missing.discard(topic)
 
-    def receive(self, job: JobType) -> None:
-        """Note that the execution for the driving message of a job starts."""
-        if job not in self._jobs:
-            self._jobs.append(job)
+    def receive(self, job: JobType, stamp: int = -1) -> None:
+        """
+        Note that the execution for the driving message of a job starts.
+
+        :param stamp: the message's header stamp, ns; not positive: it has none.
+        """
+        self._jobs.setdefault(job)
+        _forget(self._jobs)
+        if stamp > 0:
+            self._stamped[stamp] = job
+            _forget(self._stamped)
 
     def newest(self, is_open: Callable[[JobType], bool]) -> JobType | None:
-        """Return the job that an execution which starts now may answer, None if there is none."""
-        while self._jobs and not is_open(self._jobs[-1]):
-            self._jobs.pop()
-        return self._jobs[-1] if self._jobs else None
+        """
+        Return the job that an execution which starts now may answer, None if there is none.
+
+        The execution is for a message of another topic; its outputs may change this: ``named``.
+        """
+        while self._jobs and not is_open(newest := next(reversed(self._jobs))):
+            del self._jobs[newest]
+        return next(reversed(self._jobs), None)
+
+    def named(self, topic: str, stamp: int, otherwise: JobType | None) -> JobType | None:
+        """
+        Return the job that an execution answers which publishes a message with a header stamp.
+
+        A thread that publishes may call this at any time.
+
+        :param stamp: in ns; not positive: the message has none.
+        :param otherwise: returned if it is not the stamp of a driving message.
+        :return: None if the job has been answered.
+        """
+        job = self._stamped.get(stamp) if topic in self._topics else None
+        if job is None:
+            return otherwise
+        if job not in self._jobs:
+            return None
+        self._named[job] = None
+        _forget(self._named)
+        return job
 
     def is_answer(self, published: Set[str]) -> bool:
         """Return whether an execution that ends, and has published some topics, answers."""
         return not self._topics.isdisjoint(published) or not (
             self._must_publish or self._missing)
+
+    def is_guess(self, job: JobType) -> bool:
+        """Return whether it is not known which job an execution for another topic answers."""
+        return (job in self._jobs and job not in self._named
+                and next(iter(self._jobs)) != job)
 
     def answer(self, job: JobType) -> list[JobType]:
         """
@@ -80,8 +125,18 @@ class Awaiting(Generic[JobType]):
         """
         if job not in self._jobs:
             return []
-        place = self._jobs.index(job)
-        older = [each for each in list(self._jobs)[:place] if each.vertex == job.vertex]
+        older = []
+        for each in self._jobs:
+            if each == job:
+                break
+            if each.vertex == job.vertex:
+                older.append(each)
         for each in (job, *older):
-            self._jobs.remove(each)
+            del self._jobs[each]
+            self._named.pop(each, None)
         return [job, *reversed(older)]
+
+
+def _forget(several: dict[Any, Any]) -> None:
+    if len(several) > MOST_AWAITING:
+        del several[next(iter(several))]

@@ -39,7 +39,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
-from mddag_executor.core.driven import Awaiting
+from mddag_executor.core.driven import ANSWERED, Awaiting, GUESSED
 from mddag_executor.core.estimates import note_time
 from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import due_of_answer, is_judged, judge_from
@@ -65,7 +65,7 @@ from mddag_executor.core.state import (
 from mddag_executor.executor.bounds import GUARD_NS, GUARD_PART, MOST, SHORT_CALLBACK_NS
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity, SUBSCRIPTION, TIMER
-from mddag_executor.executor.jobs import Announced, Jobs, NO_ORIGIN, Origin
+from mddag_executor.executor.jobs import Announced, header_stamp, Jobs, NO_ORIGIN, Origin
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
@@ -550,10 +550,23 @@ class Engine:
         """Note the start of an execution of a driven sync: which job it may answer."""
         awaiting.hear(work.entity.topic)
         if work.origin is not None:
-            awaiting.receive(work.origin)
+            awaiting.receive(work.origin, header_stamp(work.args[0]) if work.args else -1)
             work.answers = work.origin
         else:
             work.answers = awaiting.newest(self._is_open) or NO_ORIGIN
+
+    def note_published(self, work: Work, topic: str, message: Any) -> None:
+        """
+        Note what an execution of a driven sync publishes: which job it answers.
+
+        A thread that publishes calls this without the lock.
+        """
+        awaiting = work.entity.awaiting
+        assert awaiting is not None
+        work.published |= {topic}
+        if work.origin is None:
+            work.answers = awaiting.named(
+                topic, header_stamp(message), work.answers) or NO_ORIGIN
 
     def _is_open(self, origin: Origin) -> bool:
         return self.open_release(origin) is not None
@@ -756,7 +769,10 @@ class Engine:
         origin, record = work.origin, self.record
         entity.failed += failed
         completes = [] if origin is None else [origin]
+        is_guess = False
         if entity.awaiting is not None:
+            is_guess = origin is None and work.answers is not None and (
+                entity.awaiting.is_guess(work.answers))
             completes = [] if failed else self._answered(work)
             origin = completes[0] if completes else origin
         published: dict[Origin, set[str] | None] = {}
@@ -783,8 +799,10 @@ class Engine:
                         self.path_watch.ended(
                             work, each.vertex, each.job, start, end, work.sent,
                             None if failed else published.get(each), state.scalars[JUDGE_FROM])
-            leg = 0 if entity.may_answer else (
-                x - state.job_base[slot] - tables.region_offset[vertex])
+            leg = x - state.job_base[slot] - tables.region_offset[vertex]
+            if entity.may_answer:
+                leg = GUESSED if is_guess else ANSWERED
+                entity.guessed += is_guess
             if record is not None:
                 if failed:  # first, or its completion would count
                     record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)

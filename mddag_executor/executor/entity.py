@@ -23,7 +23,8 @@ TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
 UNKNOWN_NS = 100_000_000
 """The expected duration of a callback that has not run yet, ns."""
 
-COUNTS = ('ready', 'ran', 'failed', 'dropped', 'lost', 'skipped', 'unattributed', 'busy_ns')
+COUNTS = (
+    'ready', 'ran', 'failed', 'dropped', 'lost', 'skipped', 'unattributed', 'guessed', 'busy_ns')
 _HAVE_HANDLES = (TIMER, SUBSCRIPTION, SERVICE)
 
 
@@ -40,9 +41,9 @@ class Entity:
     __slots__ = (
         'kind', 'rclpy', 'node', 'callback', 'group', 'outer', 'depth', 'label', 'source',
         'targets', 'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'lost',
-        'skipped', 'busy_ns', 'unattributed', 'removed', 'may_be_gone', 'address', 'handle',
-        'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns', 'tail_ns',
-        'publishes', 'at_once', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
+        'skipped', 'busy_ns', 'unattributed', 'guessed', 'removed', 'may_be_gone', 'address',
+        'handle', 'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns',
+        'tail_ns', 'publishes', 'at_once', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
         'collect_more', 'counts_as_eager', 'queue', 'awaiting', 'may_answer', '__weakref__')
 
     def __init__(
@@ -87,6 +88,8 @@ class Entity:
         self.skipped = 0
         self.busy_ns = 0
         self.unattributed = 0
+        # of a driven sync: answers to one of several jobs, it is not known which (``core.driven``)
+        self.guessed = 0
         # recent averages: duration of its callback, and time from its first publication to its end
         self.wall_ns = UNKNOWN_NS
         self.tail_ns = 0

@@ -129,9 +129,9 @@ def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Pub
                 return None
             state.is_tracked = True
             work = running.work
-            origin = None if work is None else work.origin or work.answers
             if work is not None and work.entity.awaiting is not None:
-                work.published |= {state.topic}
+                running.engine.note_published(work, state.topic, msg)
+            origin = None if work is None else work.origin or work.answers
             publication: Publication = running.engine.jobs.publish(
                 original, publisher, msg, state, topic, origin or NO_ORIGIN)
             return publication

@@ -99,8 +99,10 @@ class CallbackCounts(TypedDict):
     executions (``failed``: they raised an exception), ``dropped`` those that did not run (QoS
     depth, destroyed, a newer one), ``lost`` messages that the middleware dropped before the
     executor could take them, ``skipped`` releases of a timer that was too slow,
-    ``unattributed`` messages of a declared callback whose job was not found. ``interpreter_share``
-    is the fraction of its time in which it needs the interpreter, None: not known yet.
+    ``unattributed`` messages of a declared callback whose job was not found, ``guessed`` results
+    of a sync with ``driven_by`` for which it is not known which message was used (the newest
+    counts). ``interpreter_share`` is the fraction of its time in which it needs the interpreter,
+    None: not known yet.
     ``incompatible_qos`` is the policy because of which a subscription gets nothing from a
     publisher.
     """
@@ -114,6 +116,7 @@ class CallbackCounts(TypedDict):
     lost: int
     skipped: int
     unattributed: int
+    guessed: int
     busy_ns: int
     waiting: int
     holds_interpreter: bool

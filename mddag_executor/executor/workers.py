@@ -70,7 +70,7 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.hall import Announced, Spinner
-from mddag_executor.executor.jobs import PublisherState
+from mddag_executor.executor.jobs import header_stamp, PublisherState
 from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.pausing import can_pause, Pause
@@ -200,7 +200,8 @@ class WorkerThread:
         if record is not None or is_watched:
             now = self.pool.clock.now()
             if record is not None:
-                record(PUBLICATION, now, self.vtid, state.address, id(msg))
+                record(PUBLICATION, now, self.vtid, state.address, id(msg),
+                       max(0, header_stamp(msg)))
             if is_watched and work is not None:
                 work.sent += (topic, now),
         if work is not None and topic not in work.entity.publishes:

@@ -65,7 +65,7 @@ RELEASES = _table(
 EXECUTIONS = _table(
     process='i2', callback='i8', dag='i2', vertex='i4', job='i8', leg='i2', piece='i4',
     thread='i4', worker='i2', ready='i8', began='i8', start='i8', end='i8', busy='i8', cpu='i8',
-    holds_gil='?', completes='i1', message='i4', order='i4')
+    holds_gil='?', completes='i1', guessed='?', message='i4', order='i4')
 PUBLICATIONS = _table(
     process='i2', publisher='i8', execution='i8', vertex='i4', time='i8', source_timestamp='i8')
 TAKES = _table(execution='i8', message='i8', time='i8')
@@ -192,6 +192,14 @@ class Recording:
                 'callback', 'count'))):
             counts[self.callback_name(callback)] += count
         return dict(counts)
+
+    @property
+    def guessed(self) -> dict[str, int]:
+        """Return by sync the number of results of which the driving message is a guess."""
+        vertex, count = np.unique(
+            self.executions['vertex'][self.executions['guessed']], return_counts=True)
+        return {self.task_set.vertices[v].callback.key: n for v, n in zip(
+            vertex.tolist(), count.tolist()) if v >= 0}
 
     @property
     def unjudged(self) -> dict[int, int] | None:

@@ -11,6 +11,7 @@ from typing import Any
 from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import (
     drift_lines,
+    guessed_lines,
     never_due_lines,
     percent,
     requirement_table,
@@ -58,6 +59,7 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
         if numbers:
             yield f'{counted(sum(numbers.values()), one, many)}: ' + listed(
                 [f'{name} {n}' for name, n in numbers.items()])
+    yield from guessed_lines(_numbers(callbacks, 'guessed'))
     for each in result.get('exclusion', ()):
         if each['waited_ns'] >= SHOWN_NS:
             yield (f'callbacks of --node {printable(each["program"])} waited '

@@ -9,6 +9,7 @@ from typing import Any
 
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.tables import (
+    guessed_lines,
     ratio,
     requirement_table,
     run_lines,
@@ -159,6 +160,7 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     if lost:
         yield (f'{counted(sum(lost.values()), "message")} lost by the middleware: '
                + listed([f'{name} {n}' for name, n in lost.items()]))
+    yield from guessed_lines(result.get('guessed', {}))
 
 
 def _use(result: Mapping[str, Any]) -> str:

@@ -179,6 +179,14 @@ def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
         yield f'never due, so not judged: {counted(len(never), "sink")}: {listed(never)}'
 
 
+def guessed_lines(guessed: Mapping[str, int]) -> Iterator[str]:
+    """Yield a line about results of syncs of two rates that may belong to another job, if any."""
+    if guessed:
+        yield (f'{counted(sum(guessed.values()), "result")} of a sync with driven_by counted for '
+               'the newest of several messages that waited, as no header stamp says which one was '
+               'used: ' + listed([f'{name} {n}' for name, n in guessed.items()]))
+
+
 def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:
     """Yield the lines about a run, below a table of its sinks; ``more`` about its settings."""
     yield verdicts_line(result['dags'])

@@ -211,13 +211,15 @@ class Messages:
         current = self._loop.current
         if current is not None:
             current.work.entity.publishes.add(outlet.state.topic)
-        self._loop.send(partial(self._leave, outlet, data), partial(self._record, outlet))
+        self._loop.send(partial(self._leave, outlet, data),
+                        partial(self._record, outlet, max(0, header_stamp(msg))))
 
-    def _record(self, outlet: Outlet, thread: int) -> None:
+    def _record(self, outlet: Outlet, header: int, thread: int) -> None:
         if self._engine.record is not None:
             self._sequence += 1
             self._engine.record(
-                PUBLICATION, self._loop.now, thread, outlet.state.address, self._sequence)
+                PUBLICATION, self._loop.now, thread, outlet.state.address, self._sequence,
+                header)
 
     def _leave(self, outlet: Outlet, data: bytes, origin: Origin | None, release: int) -> None:
         """Send a message to the outputs and to the subscriptions."""

@@ -27,6 +27,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mddag_executor.core import legs_of
+from mddag_executor.core.driven import ANSWERED, GUESSED
 from mddag_executor.recording.columns import Growing, rows, Table
 from mddag_executor.recording.tables import (
     ALL_LEGS,
@@ -264,7 +265,10 @@ class ExecutionJoin:
         in_file = sort_by(event[which])
         which, row = which[in_file], row[in_file]
         table, event = self._executions.rows(), event[which]
-        table['leg'][row], table['cpu'][row] = leg[which], complete['cpu_time'][event]
+        # no leg: see ``core.driven``
+        guessed = (leg[which] == GUESSED) & (self._numbering.n_legs[table['vertex'][row]] == 1)
+        table['leg'][row] = np.where(guessed, ANSWERED, leg[which])
+        table['guessed'][row], table['cpu'][row] = guessed, complete['cpu_time'][event]
         table['holds_gil'][row] = complete['held_interpreter'][event]
         table['completes'][row] = np.where(complete['last_leg'][event], VERTEX, LEG)
         self._completed.add(rows(

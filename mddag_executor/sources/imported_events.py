@@ -40,7 +40,7 @@ KINDS: dict[str, tuple[Any, ...]] = {
     'ros2:callback_start': (START, 'callback'),
     'ros2:callback_end': (END, 'callback'),
     'ros2:rclcpp_intra_publish': (INTRA, 'publisher_handle', 'message'),
-    'ros2:rclcpp_publish': (RCLCPP, 'publisher_handle', 'message'),
+    'ros2:rclcpp_publish': (RCLCPP, 'publisher_handle', 'message', 'message_timestamp'),
     'ros2:rcl_publish': (RCL, 'publisher_handle', 'message'),
     'ros2:rmw_publish': (RMW_PUBLISH, 'message', 'timestamp_ source_timestamp'),
     'ros2:dispatch_subscription_callback': (

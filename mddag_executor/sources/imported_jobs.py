@@ -113,8 +113,8 @@ class ImportedJobs:
         self._row, self._vertex = np.full((2, len(runs)), UNKNOWN)
         self._row[self.sources], self._vertex[self.sources] = np.arange(len(dag)), source
         self._leg = np.zeros(len(runs), dtype=np.int64)
-        #: By run whether it answers a job, if it is of a driven sync.
-        self._answers = np.zeros(len(runs), dtype=np.bool_)
+        #: By run whether it answers a job, if it is of a driven sync; whether this is a guess.
+        self._answers, self._guessed = np.zeros((2, len(runs)), dtype=np.bool_)
         self._follow_messages()
 
     def _index(self, targets: Sequence[Target | None]) -> None:
@@ -174,10 +174,13 @@ class ImportedJobs:
                              for each in self._targets], dtype=np.bool_)[runs['callback']]
             mine &= self._first == np.arange(len(runs))
             sent = np.flatnonzero((messages['run'] >= 0) & mine[messages['run']])
-            published: dict[int, set[str]] = {}
-            for run, topic in zip(messages['run'][sent].tolist(),
-                                  self._links.topic_of[sent].tolist()):
-                published.setdefault(run, set()).add(names[topic])
+            published: dict[int, list[tuple[str, int]]] = {}
+            for run, topic, header in zip(
+                    messages['run'][sent].tolist(), self._links.topic_of[sent].tolist(),
+                    messages['header'][sent].tolist()):
+                published.setdefault(run, []).append((names[topic], header))
+            stamps = np.append(messages['header'], 0)[runs['message']]
+            stamps = np.where(stamps != 0, stamps, runs['stated'])
             which = np.flatnonzero(mine)
             times = [*zip(runs['at'][which].tolist(), which.tolist(), [True] * len(which)),
                      *zip(runs['end_at'][which].tolist(), which.tolist(), [False] * len(which))]
@@ -192,11 +195,15 @@ class ImportedJobs:
                     if not is_other and self._row[run] >= 0:
                         job = _Job(int(self._vertex[run]), int(self._row[run]))
                         job_of[run] = job
-                        awaiting.receive(job)
-                elif at >= 0 and (answered := job_of.get(run)) is not None and (
-                        awaiting.is_answer(published.get(run, set()))
-                        and awaiting.answer(answered)):
-                    self._answers[run] = True
+                        awaiting.receive(job, int(stamps[run]))
+                    continue
+                answered, sent_by = job_of.get(run), published.get(run, [])
+                for topic, header in sent_by if is_other else ():
+                    answered = awaiting.named(topic, header, answered)
+                is_guess = is_other and answered is not None and awaiting.is_guess(answered)
+                if at >= 0 and answered is not None and awaiting.is_answer(
+                        {topic for topic, _ in sent_by}) and awaiting.answer(answered):
+                    self._answers[run], self._guessed[run] = True, is_guess
                     self._vertex[run], self._row[run] = answered
         return int(self._answers.sum()) > before
 
@@ -210,6 +217,7 @@ class ImportedJobs:
         runs, known = self._links.runs, self._row >= 0
         self.releases['release'] = release
         table['vertex'], table['leg'] = self._vertex, self._leg
+        table['guessed'] = self._guessed
         table['ready'] = table['ready'][self._first]
         table['job'], table['dag'] = UNKNOWN, UNKNOWN
         for name in ('job', 'dag'):

@@ -133,7 +133,7 @@ _RUN = np.dtype([
     ('message', 'i8')])
 _MESSAGE = np.dtype([
     ('at', 'i8'), ('publisher', 'i8'), ('run', 'i8'), ('time', 'i8'), ('stamp', 'i8'),
-    ('message', 'i8'), ('within', '?')])
+    ('message', 'i8'), ('header', 'i8'), ('within', '?')])
 
 
 class Links:
@@ -147,7 +147,8 @@ class Links:
         not recorded), ``stamp`` and ``stated`` (source and header stamp of its message, 0:
         unknown), ``taken`` (when the message was taken; 0: unknown), ``message`` (-1: unknown).
     :ivar messages: publications: ``at`` (event), ``publisher`` (index of ``publishers``, -1:
-        unknown), ``run`` (-1: none), ``time``, ``stamp``, ``within`` (only within the process).
+        unknown), ``run`` (-1: none), ``time``, ``stamp`` and ``header`` (source and header stamp,
+        0: unknown), ``within`` (only within the process).
     :ivar topics: numbers of topics by name; ``topic_of``: by message the number of its topic.
     :ivar takes: executions with messages that they took themselves.
     :ivar threads: process and thread id, by index.
@@ -356,6 +357,8 @@ class Links:
         found = rows(_MESSAGE, len(at))
         found['at'], found['publisher'], found['time'] = at, so_far[at], table['time'][at]
         found['message'], found['within'] = table['b'][at], kind[at] == INTRA
+        rclcpp = np.flatnonzero(kind == RCLCPP)
+        found['header'][self._row[rclcpp]] = table['c'][rclcpp]
         found['run'] = self._running(publishes)[~joins[publishes]]
         found['within'][self._row[after_intra]] = False
         for again in (after_intra, after_rclcpp):

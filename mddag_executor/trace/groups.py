@@ -27,7 +27,7 @@ EXECUTION, PUBLICATION = 'execution', 'publication'
 _VALUES = {
     EXECUTION: 'start vtid callback dag vertex job worker ready deadline end completed whole leg '
                'cpu_time held',
-    PUBLICATION: 'time vtid publisher message'}
+    PUBLICATION: 'time vtid publisher message header_stamp'}
 """What follows the name of an entry; ``completed`` is the core's time of the completion."""
 
 GROUPS = {
@@ -38,7 +38,7 @@ GROUPS = {
         'mddag:complete':
             'completed callback dag vertex job whole end leg cpu_time held'},
     PUBLICATION: {
-        'ros2:rclcpp_publish': 'time publisher message none',
+        'ros2:rclcpp_publish': 'time publisher message header_stamp',
         'ros2:rcl_publish': 'time publisher message'}}
 """The events of an entry, in the order in which they are written: time and fields of each."""
 

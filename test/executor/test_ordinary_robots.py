@@ -10,6 +10,8 @@ import time
 from mddag_executor import replay, reschedule
 from mddag_executor.analysis.drafting import System
 from mddag_executor.executor import current_job
+from mddag_executor.report.live_runs import live_lines
+from mddag_executor.report.replays import summary
 from msg_graph import loads
 from msg_graph.draft import accept, declaration_of
 import pytest
@@ -181,7 +183,7 @@ class Fusion:
             topic: self.nodes[node].create_publisher(Header, topic, 100) for node, topic in (
                 ('lidar', '/points'), ('camera', '/image'), ('detector', '/boxes'),
                 ('fusion', '/obstacles'), ('fusion', '/alarm'))}
-        numbers = count()
+        self.numbers = count()
         for node, topic, function in (
                 ('detector', '/image', lambda message: self.topics['/boxes'].publish(message)),
                 ('fusion', '/points', self.on_points), ('fusion', '/boxes', self.on_boxes),
@@ -189,10 +191,13 @@ class Fusion:
                 ('brake', '/alarm', partial(self.note, 'alarm'))):
             self.nodes[node].create_subscription(Header, topic, function, 100)
         self.timers = [
-            self.nodes['lidar'].create_timer(0.03, lambda: self.topics['/points'].publish(
-                Header(frame_id=str(next(numbers)))), autostart=False),
+            self.nodes['lidar'].create_timer(
+                0.03, lambda: self.topics['/points'].publish(self.scan()), autostart=False),
             self.nodes['camera'].create_timer(
                 0.02, lambda: self.topics['/image'].publish(Header()), autostart=False)]
+
+    def scan(self):
+        return Header(frame_id=str(next(self.numbers)))
 
     def on_points(self, message):
         number = int(message.frame_id)
@@ -215,8 +220,43 @@ class Fusion:
         self.ran[what].append((int(message.frame_id), -1 if job is None else job.job))
 
 
-def run_fusion(make_executor, make_node, graph, path):
-    robot = Fusion(make_node)
+class Pairing(Fusion):
+    """
+    Fuses each fourth boxes with the last scan but one, though the last one waits too.
+
+    That is what message_filters does if that scan is nearer in time.
+    """
+
+    stamps = True
+
+    def __init__(self, make_node):
+        super().__init__(make_node)
+        self.scans, self.heard = [], 0
+
+    def scan(self):
+        message = super().scan()
+        message.stamp.sec = 1 + int(message.frame_id) if self.stamps else 0
+        return message
+
+    def on_points(self, message):
+        self.scans.append(message)
+
+    def on_boxes(self, _):
+        self.heard += 1
+        if self.heard % 4 == 0 and len(self.scans) > 1:
+            scan = self.scans[-2]
+            del self.scans[:-1]
+            self.fuse(scan)
+
+
+class Unstamped(Pairing):
+    """The same without header stamps."""
+
+    stamps = False
+
+
+def run_fusion(make_executor, make_node, graph, path, kind=Fusion):
+    robot = kind(make_node)
     executor = make_executor(graph, num_workers=2, trace=str(path))
     for node in robot.nodes.values():
         executor.add_node(node)
@@ -224,7 +264,8 @@ def run_fusion(make_executor, make_node, graph, path):
     for timer in robot.timers:
         timer.reset()
     with Spinning(executor):
-        assert wait_for(lambda: any(n >= 24 and n % 3 == 0 for n, _ in robot.ran['obstacles']))
+        assert wait_for(lambda: any(
+            n >= 24 and (n % 3 == 0 or kind is not Fusion) for n, _ in robot.ran['obstacles']))
         for timer in robot.timers:
             timer.cancel()
         assert wait_for(lambda: is_idle(executor))
@@ -252,6 +293,46 @@ def test_a_sync_of_two_rates(make_executor, make_node, tmp_path):
     # a timer that was cancelled while it waited runs there
     completed, _, late, _ = verdicts(reschedule(path, workers=2).result())['/brake:stop']
     assert (completed >= live['/brake:stop'][0], late) == (True, 0)
+
+
+def test_the_stamp_of_a_result_says_which_of_several_messages_was_used(
+        make_executor, make_node, tmp_path):
+    """Then no result is a guess, live, as recorded, and in a run without declaration."""
+    path, undeclared = tmp_path / 'run.mcap', tmp_path / 'undeclared.mcap'
+    robot, statistics = run_fusion(make_executor, make_node, loads(FUSED), path, Pairing)
+    last = robot.ran['obstacles'][-1][0]
+    if not statistics['callbacks']['/lidar:read']['skipped']:   # else jobs have other numbers
+        assert all(number == job for each in robot.ran.values() for number, job in each)
+    live = verdicts(statistics)
+    assert live['/brake:stop'][0] == last + 1
+    assert not any(each['guessed'] for each in statistics['callbacks'].values())
+    assert verdicts(result := replay(path).result()) == live
+    assert 'guessed' not in result
+    robot, _ = run_fusion(make_executor, make_node, None, undeclared, Pairing)
+    result = replay(undeclared, loads(FUSED)).result()
+    assert verdicts(result)['/brake:stop'][0] == robot.ran['obstacles'][-1][0] + 1
+    assert 'guessed' not in result
+
+
+def test_results_that_may_belong_to_another_message_are_counted(
+        make_executor, make_node, tmp_path):
+    """Without header stamps they count for the newest one, live and as recorded, and are named."""
+    path, undeclared = tmp_path / 'run.mcap', tmp_path / 'undeclared.mcap'
+    robot, statistics = run_fusion(make_executor, make_node, loads(FUSED), path, Unstamped)
+    guessed = {name: each['guessed'] for name, each in statistics['callbacks'].items()
+               if each['guessed']}
+    assert guessed == {'/fusion:fuse': len(robot.ran['obstacles'])}
+    assert verdicts(statistics)['/brake:stop'][0] > robot.ran['obstacles'][-1][0] + 1
+    result = replay(path).result()
+    assert (verdicts(result), result['guessed']) == (verdicts(statistics), guessed)
+    line = (f'{guessed["/fusion:fuse"]} results of a sync with driven_by counted for the newest '
+            'of several messages that waited, as no header stamp says which one was used: '
+            f'/fusion:fuse {guessed["/fusion:fuse"]}')
+    assert line in [*summary(result)]
+    assert line in [*live_lines({**statistics, 'measured': None})]
+    robot, _ = run_fusion(make_executor, make_node, None, undeclared, Unstamped)
+    result = replay(undeclared, loads(FUSED)).result()
+    assert result['guessed'] == {'/fusion:fuse': len(robot.ran['obstacles'])}
 
 
 def test_a_sync_of_two_rates_in_a_run_without_declaration(make_executor, make_node, tmp_path):

@@ -183,15 +183,15 @@ JOB = st.integers(-1, 2 ** 63 - 1)
 EXECUTIONS = st.tuples(
     st.just(EXECUTION), TIME, SMALL, ADDRESS, SMALL, SMALL, JOB, SMALL, TIME, TIME, TIME, TIME,
     st.booleans(), SMALL, TIME, st.booleans())
-PUBLICATIONS = st.tuples(st.just(PUBLICATION), TIME, SMALL, ADDRESS, ADDRESS)
+PUBLICATIONS = st.tuples(st.just(PUBLICATION), TIME, SMALL, ADDRESS, ADDRESS, ADDRESS)
 SINGLE = st.tuples(st.just('callback_end'), TIME, SMALL, ADDRESS)
 
 
 def one_by_one(entry):
     name, time, vtid, *rest = entry
     if name == PUBLICATION:
-        publisher, message = rest
-        return [('rclcpp_publish', time, vtid, publisher, message, 0),
+        publisher, message, header = rest
+        return [('rclcpp_publish', time, vtid, publisher, message, header),
                 ('rcl_publish', time, vtid, publisher, message)]
     if name != EXECUTION:
         return [entry]

@@ -79,7 +79,7 @@ def test_what_cannot_be_written_costs_nothing_else(tmp_path, caplog):
         ('callback_end', START, 1, 'text'), ('callback_end', -START, 1, 2), (), ([], START, 1),
         ('callback_end', START, 1, object()), ('callback_end', None, 1, 2),
         ('task_set', START, 1, b'bytes', 'f', 'rad', 1, 1, 1, True),
-        (EXECUTION, START, 1), (PUBLICATION, START, 1, 'text', 2), (PUBLICATION,),
+        (EXECUTION, START, 1), (PUBLICATION, START, 1, 'text', 2, 3), (PUBLICATION,),
         (EXECUTION, START, 1, -1, 0, 0, 0, 0, 0, 0, 0, 0, True, 0, 0, False)]
     lost = len(bad) + 1 + 2 * 3 + 2 * 1  # two groups of four events, and two of two
     with closing(TraceWriter(path, flush_interval_s=FAST)) as writer:
