@@ -28,7 +28,7 @@ from typing import Any, NoReturn, TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, verdicts
-from mddag_executor.cli.main import status_of
+from mddag_executor.cli.main import EXIT_SIGNAL, status_of
 from mddag_executor.cli.text import Progress, set_quiet, warn
 from mddag_executor.errors import from_user_code, MddagError, UsageError, UserCodeError
 from mddag_executor.output_rules import remove_recording
@@ -215,8 +215,11 @@ def run_here(
     plan = None
     host: Host | None = None
     programs: list[Program] = []
+    # What the end needs is imported here: an interrupt of an import in a program may keep the lock
+    # of the imported module for ever.
+    from mddag_executor.hosting import processes  # noqa: F401
+    from mddag_executor.hosting.measure import ExecutionPlan
     if args.synthetic is not None:
-        from mddag_executor.hosting.measure import ExecutionPlan
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with ExitStack() as stack:
         stack.callback(faulthandler.cancel_dump_traceback_later)
@@ -247,7 +250,7 @@ def run_here(
         try:
             with redirect_stdout(output):
                 outcome = _run(args, task_set, executor, host, programs, plan, signals, leave)
-        except MddagError:
+        except (MddagError, SystemExit):
             if trace is not None:  # nothing ran: leave no empty trace behind
                 remove_recording(str(trace))
             raise
@@ -423,6 +426,8 @@ def _run_programs(
             host.start(
                 executor, programs, ros_arguments(args.ros_args), session.stop,
                 lambda: session.stopped)
+            if host.ended_by is not None and not any(g.has_begun for g in host.guests):
+                raise SystemExit(EXIT_SIGNAL + host.ended_by)  # as if it had come before the run
             begins: int | None = None
             if args.process is not None:  # messages that are lost until then do not count
                 try:

@@ -19,8 +19,11 @@ from mddag_executor.core.state import (
     ALONE,
     as_object,
     Decision,
+    DONE,
+    DROPPED,
     empty,
     fill_state,
+    IDLE,
     NO_PLACE,
     OPEN,
     OUTER,
@@ -67,6 +70,7 @@ class Scheduler:
         self.state = as_object(state)
         self._free_groups: list[int] = []
         self._free_queues: list[int] = []
+        self._free_outer_groups: list[int] = []
         # bound here: a method would be one more call for each execution
         rule = self.tables, self.state
         self.ready: Callable[[int, int], None] = partial(
@@ -140,7 +144,21 @@ class Scheduler:
 
     def new_outer_group(self) -> int:
         """Add an outer group, which is closed, and return its number."""
-        return add_outer_group(self.state)
+        state = self.state
+        if self._free_outer_groups:
+            used = {outer for outer, kind in zip(state.x_outer, state.x_state)
+                    if kind not in (IDLE, DROPPED, DONE)}
+            for place, outer in enumerate(self._free_outer_groups):
+                if outer not in used and not state.outer_heap[outer]:
+                    del self._free_outer_groups[place]
+                    state.outer_limit[outer] = state.outer_once[outer] = 0
+                    state.outer_wait[outer] = 0
+                    return outer
+        return add_outer_group(state)
+
+    def free_outer_group(self, outer: int) -> None:
+        """Free an outer group's number, for reuse after its executions have ended."""
+        self._free_outer_groups.append(outer)
 
     def open_outer(self, outer: int, limit: int, once: bool = False) -> None:
         """Set how many executions of an outer group may run; see ``core.queues.open_outer``."""

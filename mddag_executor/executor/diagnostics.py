@@ -41,6 +41,7 @@ from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.shutdown import is_over, join, stop_at_exit
 from mddag_executor.text import counted
 from rclpy.logging import get_logger
+from rclpy.type_support import check_for_type_support
 
 if TYPE_CHECKING:
     from diagnostic_msgs.msg import DiagnosticArray
@@ -344,6 +345,11 @@ class Diagnostics:
         recorder: Recorder | None, period_ns: int, thresholds: Thresholds, process: str | None,
         notifier: MissNotifier | None,
     ) -> None:
+        # Here, not in the thread: an interrupt of an import in the main thread may keep the lock
+        # of the imported module for ever.
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+        check_for_type_support(DiagnosticArray)
+        self._types = DiagnosticArray, DiagnosticStatus, KeyValue
         self._context = pool.context
         self._registry = registry
         self._period_ns = period_ns
@@ -397,13 +403,11 @@ class Diagnostics:
                 get_logger('mddag_executor').error(f'there will be no diagnostics: {error}')
 
     def _publish(self) -> None:
-        from diagnostic_msgs.msg import DiagnosticArray
-
         # no executor runs the node, since it has no callbacks
         node = quiet_node(
             f'{NODE_NAME}_{os.getpid()}', self._context, is_remapped=True)
         try:
-            publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
+            publisher = node.create_publisher(self._types[0], TOPIC, 10)
             due = time.monotonic_ns() + self._period_ns
             while not self._ending.wait(max(0, due - time.monotonic_ns()) / 1e9):
                 if is_over(self._context):
@@ -416,14 +420,14 @@ class Diagnostics:
                 node.destroy_node()
 
     def _message(self) -> DiagnosticArray:
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-        message = DiagnosticArray()
+        array, status_of, value_of = self._types
+        message = array()
         # system time: simulated time may stand still, and this is about the process
         stamp = message.header.stamp
         stamp.sec, stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
         for status in self.statuses():
-            message.status.append(DiagnosticStatus(
+            message.status.append(status_of(
                 level=bytes([status.level]), name=status.name, message=status.message,
                 hardware_id=self._hardware_id,
-                values=[KeyValue(key=key, value=value) for key, value in status.values.items()]))
+                values=[value_of(key=key, value=value) for key, value in status.values.items()]))
         return message

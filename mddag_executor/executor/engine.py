@@ -713,6 +713,10 @@ class Engine:
         """Add an outer group of callbacks (see ``core.rules``, rule 4); it is closed."""
         return self.scheduler.new_outer_group()
 
+    def free_outer_group(self, outer: int) -> None:
+        """Let the number of an outer group without callbacks be used again."""
+        self.scheduler.free_outer_group(outer)
+
     def open_outer(self, outer: int, limit: int, once: bool = False) -> bool:
         """
         Set how many executions of an outer group may run at a time.
@@ -727,9 +731,11 @@ class Engine:
                 state, first_of(state, entry))
             for queue in (state.ready, state.held_back) for entry in queue)
 
-    def outer_wait_ns(self, outer: int) -> int:
-        """Return how long executions have waited for others of their outer group."""
-        return self._state.outer_wait[outer]
+    def take_outer_wait(self, outer: int) -> int:
+        """Return how long (ns) executions have waited for others of it since the last call."""
+        waited = self._state.outer_wait[outer]
+        self._state.outer_wait[outer] = 0
+        return waited
 
     def _is_outer_open(self, outer: int) -> bool:
         state = self._state

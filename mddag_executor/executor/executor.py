@@ -333,6 +333,7 @@ class MultiDeadlineExecutor(BareExecutor):
         task, work = make_task(
             self._task_entities.of(callback, args, outer), self, self._pool.resume,
             self._unclaimed, self._pool.loops, callback, args, kwargs)
+        task.outer_group = self._pool.outer_groups.get(outer)
         is_spinning = self._spinning.locked()
         if is_spinning:
             self._pool.report(self._engine.ready, work)
@@ -357,9 +358,8 @@ class MultiDeadlineExecutor(BareExecutor):
     def put(self, node: Node, group: OuterGroup | None) -> None:
         """Let the callbacks of a node belong to an outer group; None: to none."""
         groups = self._registry.outer_groups
-        number = -1 if group is None else group.number
-        if groups.get(node, -1) != number:
-            groups[node] = number
+        if groups.get(node) is not group:
+            groups[node] = group
             self._upkeep.change()
             if self._pool.running:
                 self._upkeep.refresh()

@@ -26,7 +26,8 @@ class OuterGroup:
     """
     The callbacks of a program's executor, of which so many may run at a time.
 
-    It is also what runs the done callbacks of its clients' futures.
+    It is also what runs the done callbacks of its clients' futures.  It exists as long as the one
+    who made it, a node or an unfinished task refers to it; then its number is used again.
 
     :param create_task_in: the executor's method that makes tasks of a group.
     :ivar number: in the core.
@@ -39,8 +40,12 @@ class OuterGroup:
         self._pool = pool
         self._create_task_in = create_task_in
         with pool.lock:
+            while pool.freed_outer_groups:
+                pool.engine.free_outer_group(pool.freed_outer_groups.popleft())
             self.number = pool.engine.new_outer_group()
         pool.outer_groups[self.number] = self
+        # A finalizer may come anywhere, also in a thread that has the lock.
+        weakref.finalize(self, pool.freed_outer_groups.append, self.number).atexit = False
         self.n_nested = 0
         # what ``open`` has set
         self._limit, self._once = 0, False
@@ -88,9 +93,10 @@ class OuterGroup:
                 self.n_nested -= 1
                 self._apply()
 
-    def wait_ns(self) -> int:
-        """Return how long callbacks have waited for others of the group."""
-        return self._pool.engine.outer_wait_ns(self.number)
+    def take_wait_ns(self) -> int:
+        """Return how long callbacks have waited for others of the group since the last call."""
+        with self._pool.lock:
+            return self._pool.engine.take_outer_wait(self.number)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
         """Run a function or coroutine as one of the group."""

@@ -88,8 +88,8 @@ class Registry:
         # all that are not freed yet
         self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
         self._numbers: set[int] = set()
-        #: the core's outer groups of nodes
-        self.outer_groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
+        #: the outer groups of nodes
+        self.outer_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
         self._counting = threading.Lock()
         self.by_id: dict[int, Entity] = {}
         # the executor's own subscriptions
@@ -118,7 +118,8 @@ class Registry:
                 name = self._name(node)
             except InvalidHandle:
                 continue  # destroyed after it was listed
-            outer = self.outer_groups.get(node, -1)
+            group = self.outer_groups.get(node)
+            outer = -1 if group is None else group.number
             for kind, some in zip(LISTS.values(), lists):
                 for rclpy_entity in some:
                     key = id(rclpy_entity)

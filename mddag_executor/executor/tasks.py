@@ -49,7 +49,10 @@ class ObservedTask(BareTask):
     :ivar maker: the execution whose callback has created it, or None.
     :ivar deferred_to: receives a deferred exception that was not handled.
     :ivar spins: how many spins wait for its end.
+    :ivar outer_group: the one that it belongs to, which exists as long as the task.
     """
+
+    outer_group: Any = None
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.observed = False

@@ -275,7 +275,9 @@ class WorkerPool:
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None, int], bool] | None = None
         #: by number: see ``MultiDeadlineExecutor.new_outer_group``
-        self.outer_groups: dict[int, Any] = {}
+        self.outer_groups: Any = weakref.WeakValueDictionary()
+        #: numbers of those that have been destroyed
+        self.freed_outer_groups: deque[int] = deque()
         self.context: Any = None
         #: called when entities have changed, or the context has ended
         self.wake_executor: Callable[[], None] = _nothing

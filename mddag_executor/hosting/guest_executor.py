@@ -176,10 +176,17 @@ class GuestExecutor:
     def _close(self, groups: list[Any]) -> None:
         """Let no more callbacks run; in a single thread, the running one would end before."""
         is_single = _limit(self) == 1
+        try:
+            for group in groups:
+                group.open(0)
+        except KeyboardInterrupt:
+            for group in groups:
+                group.open(0)
+            raise
         for group in groups:
-            group.open(0)
             while is_single and group.n_running() and not self.host.is_over(self.guest):
                 time.sleep(_POLL_S)
+        self.host.note_waiting(groups)
 
     def _await_callbacks(self) -> None:
         """Wait until the callbacks that run have finished, if an interrupt ends the run."""

@@ -43,6 +43,7 @@ Differences from a separate process: the arguments and the domain that a program
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
@@ -89,6 +90,7 @@ class Guest:
     A running program.
 
     :ivar nodes: its nodes on the executor.
+    :ivar has_begun: whether its main has begun, so that a signal reaches it.
     :ivar is_complete: whether ``nodes`` holds all initial nodes, or the program has ended.
     :ivar ended: whether its nodes run no more callbacks; it may initialise rclpy again.
     :ivar finished: whether its main has ended.
@@ -99,11 +101,14 @@ class Guest:
     :ivar signals: those that rclpy handles for it, with the Python handler of each at that time,
         which rclpy's calls.
     :ivar interrupted: whether a SIGINT has come that its next spin raises.
+    :ivar waited_ns: how long its callbacks have waited for others of it, in groups that it has
+        closed.
     """
 
     program: Program
     thread: threading.Thread = field(init=False)
     nodes: list[Node] = field(default_factory=list)
+    has_begun: bool = False
     is_complete: bool = False
     ended: bool = False
     finished: bool = False
@@ -113,6 +118,7 @@ class Guest:
     done: threading.Event = field(default_factory=threading.Event)
     signals: dict[int, Any] = field(default_factory=dict)
     interrupted: bool = False
+    waited_ns: int = 0
     global_executor: Any = None
 
 
@@ -142,7 +148,7 @@ class Host:
         # outer groups by executor, or by node of a global one, and the executors by their number
         self._groups: Any = weakref.WeakKeyDictionary()
         self._executor_of_group: Any = weakref.WeakValueDictionary()
-        self._opened: dict[int, tuple[Any, str]] = {}
+        self._opened: Any = weakref.WeakKeyDictionary()  # the program of each group
         self._of_callbacks: Any = weakref.WeakSet()  # threads
         # the node behind each object that a program has added as a node
         self._behind: Any = weakref.WeakKeyDictionary()
@@ -274,6 +280,8 @@ class Host:
                 self.guests.append(guest)
                 guest.thread.start()
             self._wait_for_nodes(guest)
+            if not guest.has_begun and is_ending():
+                break
             self._check_start(guest)
             if isinstance(guest.error, KeyboardInterrupt):
                 break
@@ -301,7 +309,7 @@ class Host:
             raise ProgramFailed(
                 spec, f'it failed while starting ({describe(guest.error)})',
                 'correct it, or see how it runs by itself') from guest.error
-        if guest.ended and not guest.nodes and not guest.uses_ros:
+        if guest.ended and not guest.nodes and not guest.uses_ros and guest.error is None:
             raise LoadingError(
                 spec, 'it ended and neither returned a node nor initialised rclpy',
                 'name what makes the node, or a main() that spins it')
@@ -311,8 +319,13 @@ class Host:
         self.guest_of[guest.thread] = guest
         try:
             if self._has_main(guest):
-                with self._signals.of_program():
-                    self._run_main(guest)
+                try:
+                    with self._signals.of_program():
+                        self._run_main(guest)
+                except KeyboardInterrupt as error:  # before its first line, or after its last one
+                    guest.error = guest.error or error
+                    guest.finished = True
+                    self.program_ended(guest)
             else:
                 loop = asyncio.new_event_loop()  # as the main thread of a program has one
                 asyncio.set_event_loop(loop)
@@ -324,6 +337,9 @@ class Host:
             guest.done.set()
 
     def _run_main(self, guest: Guest) -> None:
+        if self._is_ending():
+            return
+        guest.has_begun = True
         try:
             try:
                 value = guest.program.run()
@@ -457,13 +473,21 @@ class Host:
         """Note whose spin has opened an outer group: it gets the ends of its callbacks."""
         self._executor_of_group[group.number] = executor
         if executor.guest is not None:
-            self._opened[group.number] = group, executor.guest.program.spec
+            self._opened[group] = executor.guest
+
+    def note_waiting(self, groups: Iterable[Any]) -> None:
+        """Count how long callbacks have waited for others in outer groups, which may be freed."""
+        for group in groups:
+            guest = self._opened.get(group)
+            if guest is not None:
+                guest.waited_ns += group.take_wait_ns()
 
     def exclusion(self) -> list[dict[str, Any]]:
         """Return how long callbacks of each program have waited for others of it."""
-        waited = {guest.program.spec: 0 for guest in self.guests}
-        for group, spec in self._opened.values():
-            waited[spec] += group.wait_ns()
+        self.note_waiting(list(self._opened))
+        waited = Counter[str]()
+        for guest in self.guests:
+            waited[guest.program.spec] += guest.waited_ns
         return [{'program': spec, 'waited_ns': ns} for spec, ns in waited.items() if ns]
 
     def put(self, node: Node, group: Any) -> None:
@@ -526,6 +550,11 @@ class Host:
 
     # --- signals ---------------------------------------------------------------------------------
 
+    @property
+    def ended_by(self) -> int | None:
+        """Return the signal that has ended the run; None: none has."""
+        return self._signals.ended_by
+
     def ends_run(self, number: int) -> bool:
         """
         Let programs note a signal; return whether it ends the run.
@@ -535,7 +564,8 @@ class Host:
         """
         running = [guest for guest in self.guests if not guest.done.is_set()]
         nodes_only = [guest for guest in self.guests if guest.returned and not guest.ended]
-        ends = not running or bool(nodes_only) and number == signal.SIGINT
+        ends = not running or bool(nodes_only) and number == signal.SIGINT or any(
+            self._has_main(guest) and not guest.has_begun for guest in running)
         for guest in running:
             if self._has_main(guest):  # unless the program has replaced the handler meanwhile
                 ends |= number in guest.signals and (

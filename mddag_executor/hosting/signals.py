@@ -56,11 +56,13 @@ class Signals:
 
     :ivar ends_run: whether SIGINT, or a signal that a program handles, ends the run.
     :ivar wake: called after each signal, without a lock.
+    :ivar ended_by: the signal that has ended the run; None: none has.
     """
 
     def __init__(self) -> None:
         self.ends_run: Callable[[int], bool] = lambda number: True
         self.wake: Callable[[], None] = lambda: None
+        self.ended_by: int | None = None
         self._session: Ended | None = None
         self._last: float | None = None  # when one came that counts
         self._hurried = False
@@ -116,7 +118,7 @@ class Signals:
                 self._last = now
             elif not session.stopped:
                 if ends or self.ends_run(number):
-                    self._last = now
+                    self._last, self.ended_by = now, number
                     session.stop()
             elif number == signal.SIGINT and (
                     self._last is None or now - self._last > SAME_SIGNAL_S):

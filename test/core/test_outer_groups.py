@@ -173,3 +173,20 @@ def test_one_that_goes_on_may_leave_its_outer_group():
     y = core.ready_undeclared(0, -1, 0, core.new_queue(), 3)
     core.state.x_outer[y] = other
     assert core.take(0, 4) == y
+
+
+def test_the_number_of_a_freed_outer_group_is_used_again_when_none_of_it_is_left():
+    core = Scheduler(Tables.build(
+        None, legs=True, default_deadline=100, max_active_jobs=4, expire_after=1000), 2, 'rad')
+    first = core.new_outer_group()
+    x = core.ready_undeclared(0, -1, 0, core.new_queue(), 0)
+    core.state.x_outer[x] = first
+    core.open_outer(first, 1)
+    core.free_outer_group(first)
+    assert core.take(0, 1) == x
+    other = core.new_outer_group()
+    assert other != first
+    core.complete(x, 2)
+    assert core.new_outer_group() == first
+    assert core.new_outer_group() not in (first, other)
+    assert core.state.outer_limit[first] == 0

@@ -3,6 +3,7 @@
 """Unmodified programs on our executor, each a real `mddag run --node`; how they are found."""
 
 from contextlib import contextmanager
+import gc
 import json
 import os
 from pathlib import Path
@@ -13,7 +14,8 @@ import sys
 import threading
 import time
 
-from mddag_executor.hosting.host import Host
+from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.hosting.host import Guest, Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
 from mddag_executor.hosting.signals import SAME_SIGNAL_S
 import pytest
@@ -141,8 +143,8 @@ PLAIN = 'import sys, chat; sys.exit(getattr(chat, sys.argv[1])())'
 
 @pytest.mark.parametrize(('name', 'status'), [
     ('returns_status', 4), ('returns_reason', 1), ('has_a_loop', 0), ('handles_signals', 3),
-    ('stops_the_robot', 0), ('is_interrupted', 130), ('works_with_asyncio', 1),
-    ('fails_at_the_end', 1), ('exits_early', 5)])
+    ('stops_the_robot', 0), ('is_interrupted', 130), ('is_interrupted_before_it_begins', 130),
+    ('works_with_asyncio', 1), ('fails_at_the_end', 1), ('exits_early', 5)])
 def test_a_program_behaves_as_without_the_host(world, mddag, name, status):
     """It has the main thread: what it prints, what it raises and its exit status are the same."""
     plain = subprocess.run(
@@ -156,6 +158,41 @@ def test_a_program_behaves_as_without_the_host(world, mddag, name, status):
     elif name != 'exits_early':
         assert hosted.stderr == plain.stderr
     assert ('Traceback' in hosted.stderr) == ('Traceback' in plain.stderr)
+
+
+EARLY = """\
+import os, signal, threading, time
+
+has_begun = False
+
+def hit():
+    while not has_begun and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        time.sleep(0)
+    os.kill(os.getpid(), signal.SIGINT)
+
+threading.Thread(target=hit, daemon=True).start()
+
+def main():
+    global has_begun
+    has_begun = True
+    time.sleep(20.0)
+"""
+
+
+def test_an_interrupt_between_the_start_of_the_run_and_that_of_the_program_is_not_lost(
+        world, mddag, default_context):
+    Path('site/early.py').write_text(EARLY)
+    done = mddag('run', '--node', 'early:main', '--trace', 'early.mcap')
+    assert done.returncode == 130, done.stderr
+    # wherever the interrupt comes: it either reaches the program or ends the run
+    with Host() as host:
+        guest = Guest(Program('early', 'early', list))
+        guest.thread = host._main = threading.current_thread()
+        host.guests.append(guest)
+        assert host.ends_run(signal.SIGINT)
+        guest.has_begun = True
+        assert not host.ends_run(signal.SIGINT)
+        guest.done.set()
 
 
 def test_what_was_exclusive_stays_exclusive(world, mddag, monkeypatch):
@@ -330,6 +367,59 @@ def test_another_executor_gives_its_nodes_to_ours_when_it_spins(host, kind):
     spinning.join(2.0)
     assert not spinning.is_alive()
     assert host.executor.get_nodes() == []
+
+
+def test_executors_that_a_program_makes_again_and_again_leave_nothing_behind(default_context):
+    def main():
+        rclpy.init()
+        node = Node('again')
+        node.create_timer(0.0, lambda: None)
+        for _ in range(40):
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            executor.create_task(lambda: None)
+            executor.spin_once(timeout_sec=0.0)
+            executor.shutdown()
+            del executor
+            gc.collect()
+
+    executor = MultiDeadlineExecutor(num_workers=2)
+    spin = threading.Thread(target=executor.spin)
+    spin.start()
+    with Host() as host:
+        host.start(executor, [Program('main', 'main', main)])
+        assert wait_for(lambda: host.guests[0].done.is_set(), 60.0)
+        assert host.guests[0].error is None
+        assert len(executor._engine.scheduler.state.outer_limit) < 10
+        assert len(executor._pool.outer_groups) + len(host._opened) < 10
+    executor.shutdown()
+    spin.join()
+
+
+def test_a_second_interrupt_leaves_no_group_open(host):
+    class Group:
+        is_open = True
+
+        def open(self, limit, once=False):
+            if self.interrupts:
+                self.interrupts = False
+                raise KeyboardInterrupt
+            self.is_open = limit > 0
+
+        def n_running(self):
+            raise KeyboardInterrupt
+
+        def take_wait_ns(self):
+            return 0
+
+    executor = SingleThreadedExecutor()
+    for interrupts in (False, True):
+        groups = [Group() for _ in range(3)]
+        for group in groups:
+            group.interrupts = interrupts and group is groups[1]
+        with pytest.raises(KeyboardInterrupt):
+            executor._close(groups)
+        assert not any(group.is_open for group in groups)
 
 
 @pytest.mark.parametrize(('spec', 'message'), [

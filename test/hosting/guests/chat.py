@@ -169,6 +169,11 @@ def stops_the_robot():
         rclpy.shutdown()
 
 
+def is_interrupted_before_it_begins():
+    after(0.2, signal.SIGINT)
+    time.sleep(60.0)
+
+
 def is_interrupted():
     rclpy.init()
     node = Node('interrupted')
