@@ -21,7 +21,6 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 import os
 from pathlib import Path
-import shutil
 import stat
 from typing import BinaryIO, cast
 
@@ -73,6 +72,7 @@ def whole_file(path: str) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         if target.exists():
+            import shutil
             shutil.copymode(target, part)
         part.replace(target)
     except BaseException as error:

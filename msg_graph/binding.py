@@ -20,7 +20,6 @@ with topics and services with names.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from difflib import get_close_matches
 from heapq import heappop, heappush
 import re
 from typing import NamedTuple
@@ -154,8 +153,11 @@ def suggest_entity(callback: Callback, undeclared: Collection[Entity]) -> str | 
 def _closest(name: str, others: Iterable[str]) -> str | None:
     """Return the name that differs only by namespaces, or a similar one."""
     different = sorted({*others} - {name})
-    return next((each for each in different if _same_below(each, name)), None) or next(
-        iter(get_close_matches(name, different, 1)), None)
+    same = next((each for each in different if _same_below(each, name)), None)
+    if same is not None:
+        return same
+    from difflib import get_close_matches  # rarely needed
+    return next(iter(get_close_matches(name, different, 1)), None)
 
 
 def _same_below(name: str, other: str) -> bool:

@@ -53,8 +53,8 @@ from itertools import pairwise
 from os import fspath, PathLike
 from typing import Any
 
+from msg_graph.blanks import open_blanks
 from msg_graph.declaration import parse_declaration
-from msg_graph.draft import open_blanks
 from msg_graph.errors import (
     Collector,
     combine_errors,

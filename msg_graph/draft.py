@@ -30,19 +30,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field
-import re
 
+from msg_graph.blanks import MARK
 from msg_graph.duration import exact_duration, format_duration, MICROSECOND
-from msg_graph.errors import GraphError, printable
+from msg_graph.errors import printable
 from msg_graph.language import PATH
 from msg_graph.model import ExecutionTime, ReleaseFrom
 from msg_graph.yamltext import plain_scalar
 
 UNDEFINED = 'UNDEFINED'
 """CARET's word for the missing topic at the end of a path."""
-MARK = 'FILL IN'
 LEFT_OUT = '# Left out:'
-_OPEN = re.compile(rf'\s*#\s+(?:(\w+:).*\s#\s+)?{MARK}: (.*)')
 _LITTLE = 1e-4  # fraction of a period
 
 
@@ -195,16 +193,6 @@ def accept(draft: Draft) -> None:
 def declaration_of(draft: Draft, accepted: bool = False) -> str:
     """Return the text of a declaration; proposals are entries if accepted, else blanks."""
     return '\n'.join(_Writer(draft, accepted).lines()) + '\n'
-
-
-def open_blanks(text: str, file: str) -> list[GraphError]:
-    """Return an error for each open blank in a declaration."""
-    return [GraphError(
-        file, number,
-        f"{match[1] or 'this'} is a blank to fill in ({match[2]})",
-        "correct the value and take the '# ' away" if match[1] else 'do so, then remove the line')
-        for number, line in enumerate(text.splitlines(), 1)
-        if MARK in line and (match := _OPEN.fullmatch(line)) is not None]
 
 
 class _Writer:

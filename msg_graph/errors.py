@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-import difflib
 from typing import Any, cast, TypeVar
 
 T = TypeVar('T')
@@ -131,5 +130,6 @@ def listed(texts: Iterable[str], most: int = 8) -> str:
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for a misspelt word: the nearest known one, else ``otherwise``."""
+    import difflib  # rarely needed
     matches = difflib.get_close_matches(word[:_LONGEST_SHOWN], list(known), n=1)
     return f'did you mean {quoted(matches[0])}?' if matches else otherwise

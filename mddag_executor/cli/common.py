@@ -14,9 +14,7 @@ from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
-import shutil
 import sys
-import tempfile
 from typing import Any, BinaryIO, cast, TYPE_CHECKING, TypeVar
 
 from mddag_executor import __version__
@@ -83,6 +81,8 @@ def input_path(given: R) -> tuple[R | str, str]:
     global _copy
     if given != '-':
         return given, str(given)  # as the user wrote it: pathlib would change ./a
+    import shutil
+    import tempfile
     source, _copy = _stdin(), tempfile.TemporaryFile()
     shutil.copyfileobj(source, _copy, 1 << 20)
     _copy.flush()
@@ -130,7 +130,7 @@ def one_run(paths: Sequence[str], offsets: Sequence[tuple[str, int]]) -> str | T
 
 def _traces_in(path: str) -> Sequence[str]:
     if os.path.isdir(path):
-        from mddag_executor.sources.bags import is_ordinary
+        from mddag_executor.sources.kinds import is_ordinary
         names = os.listdir(path)
         found = sorted(name for name in names if name.endswith('.mcap'))
         if found and 'metadata.yaml' not in names and not is_ordinary(path):

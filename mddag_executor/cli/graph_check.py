@@ -195,7 +195,7 @@ def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
     if result['utilisation'] is not None:
         text += (f', load {result["load"]:.3f}, utilisation {result["utilisation"]:.3f} of '
                  f'{counted(result["workers"], "worker")}')
-    from msg_graph.draft import open_blanks
+    from msg_graph.blanks import open_blanks
     left = [str(each.line) for each in open_blanks(task_set.text, task_set.file)]
     if left:
         text += f'\n{counted(len(left), "blank")} left, in line {listed(left)}'

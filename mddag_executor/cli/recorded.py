@@ -88,7 +88,7 @@ class Source(NamedTuple):
     @property
     def is_bag(self) -> bool:
         """Return whether it is an ordinary bag, which can only be rescheduled."""
-        from mddag_executor.sources.bags import is_ordinary
+        from mddag_executor.sources.kinds import is_ordinary
         return isinstance(self.path, str) and is_ordinary(self.path)
 
     def check_deadlines(self) -> None:
@@ -107,7 +107,7 @@ class Source(NamedTuple):
 
 def source_of(args: argparse.Namespace) -> Source:
     """Return the recording that TRACE… names, with GRAPH's task set."""
-    from mddag_executor.sources.bags import opened_trace
+    from mddag_executor.sources.kinds import opened_trace
     task_set = None if args.graph is None else common.load_graph(args.graph)
     path, name = common.input_path(args.trace)
     trace = opened_trace(path) if isinstance(path, str) else None

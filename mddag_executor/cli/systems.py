@@ -39,7 +39,8 @@ def recorded_system(given: str) -> System:
 
 def write_declaration(output: str, text: str) -> None:
     """Write a declaration, and print how many blanks it has and how many callbacks it lacks."""
-    from msg_graph.draft import LEFT_OUT, MARK
+    from msg_graph.blanks import MARK
+    from msg_graph.draft import LEFT_OUT
     common.write_text(output, text)
     if output == '-':
         return

@@ -189,22 +189,29 @@ def nodes_of(who: Entities) -> list[list[Callback]]:
     return list(found.values())
 
 
-def match(callbacks: list[Callback], declared: TaskSet) -> dict[int, Target]:
-    """Match the callbacks of a node with declared ones; return the latter by number."""
-    binder = Binder(declared)
+def matches(who: Entities, declared: TaskSet) -> dict[int, Target]:
+    """Return by the number of a recorded callback the declared one that it matches."""
     found: dict[int, Target] = {}
-    for each in callbacks:
-        bound = None if each.entity is None or not each.number else binder.bind(each.entity)
-        if bound is not None:
-            leg = bound.topics.index(each.start) if each.start in bound.topics else 0
-            found[each.number] = Target(bound, leg, each.start if bound.topics else '')
+    # one for each time that a node of the same name runs, for example in several processes
+    binders: list[Binder] = []
+    times = Counter[str]()
+    for callbacks in nodes_of(who):
+        node = callbacks[0].node_name
+        if times[node] == len(binders):
+            binders.append(Binder(declared))
+        binder = binders[times[node]]
+        times[node] += 1
+        for each in callbacks:
+            bound = binder.bind(each.entity) if each.entity and each.number else None
+            if bound is not None:
+                leg = bound.topics.index(each.start) if each.start in bound.topics else 0
+                found[each.number] = Target(bound, leg, each.start if bound.topics else '')
     return found
 
 
 def declared_keys(who: Entities, declared: TaskSet) -> dict[int, str]:
     """Return by callback number the key of the declared callback."""
-    return {number: target.callback.key for callbacks in nodes_of(who)
-            for number, target in match(callbacks, declared).items()}
+    return {number: target.callback.key for number, target in matches(who, declared).items()}
 
 
 class Matching:
@@ -225,8 +232,7 @@ class Matching:
         self.target: dict[int, Target] = {}
         if judge is None:
             return
-        for callbacks in nodes_of(who):
-            self.target.update(match(callbacks, judge))
+        self.target = matches(who, judge)
         found = {target.callback.key for target in self.target.values()}
         self.warnings += report_missing(
             name, judge, found, [c.label for c in who.every if c.kind != 'service'],

@@ -24,7 +24,8 @@ from mddag_executor.recording.tables import Recording
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.simulate import draw_execution_times, periodic_load, read_execution_times
-from mddag_executor.sources.bags import Bag, is_ordinary
+from mddag_executor.sources.bags import Bag
+from mddag_executor.sources.kinds import is_ordinary
 from mddag_executor.sources.open import open_recording
 from mddag_executor.trace.channels import Topic
 from mddag_executor.whatif.load import LoadBuilder
@@ -52,7 +53,7 @@ class MessageBag:
     :ivar pauses: from when to when none came (see ``trace.times``).
     :ivar topics: every topic in it.
     :ivar kinds: the type of each topic, as far as it has been loaded.
-    :raises mddag_executor.sources.bags.BagError: if there is no bag.
+    :raises mddag_executor.sources.kinds.BagError: if there is no bag.
     """
 
     def __init__(self, path: str, name: str | None = None) -> None:

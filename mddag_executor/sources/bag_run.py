@@ -23,7 +23,8 @@ from mddag_executor.recording.columns import concatenate, rows
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import Ints, Recording, RELEASES, sort_by
-from mddag_executor.sources.bags import Bag, BagError
+from mddag_executor.sources.bags import Bag
+from mddag_executor.sources.kinds import BagError
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet

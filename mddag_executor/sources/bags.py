@@ -5,8 +5,8 @@ The stamps in ordinary rosbag2 recordings: arrival times and header stamps of me
 
 Theory of operation
 -------------------
-* A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  The first
-  bytes of a file, not its name, say its kind: MCAP (read with ``trace.TraceReader``), SQLite, or
+* A bag is a folder with `metadata.yaml` and the files that it names, or one such file.  Its kind
+  (``kinds``) is MCAP (read with ``trace.TraceReader``), SQLite, or
   zstd around one of them (a file-compressed bag, unpacked to a temporary file).
 * A message has its arrival (log time), its publication if the recorder stored it separately, and
   the stamp at the beginning of its content, if its type begins with a `std_msgs/Header` or a time.
@@ -26,17 +26,26 @@ from contextlib import closing, contextmanager
 import io
 import os
 from pathlib import Path
-import re
 import sqlite3
 import tempfile
 from typing import Any, BinaryIO
 
 from mddag_executor.errors import InputError
+from mddag_executor.sources.kinds import (
+    BAG_FILE,
+    BagError,
+    kind_of,
+    MCAP,
+    METADATA,
+    names_in,
+    REMEDY,
+    SQLITE,
+    ZSTD,
+)
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.blocks import other_kind
 from mddag_executor.trace.channels import Topic
-from mddag_executor.trace.errors import renamed, unreadable
+from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Ints
 from mddag_executor.trace.times import FAR_NS, NEVER, stretches
 from msg_graph import GraphError
@@ -44,13 +53,9 @@ from msg_graph.yamltext import parse_yaml, plain
 import numpy as np
 import zstandard
 
-_METADATA = 'metadata.yaml'
 _ABOUT = 'rosbag2_bagfile_information'
 _METADATA_LIMIT = 4 * 1024 * 1024
-_MCAP, _SQLITE, _ZSTD = b'\x89MCAP0\r\n', b'SQLite format 3\0', b'\x28\xb5\x2f\xfd'
-_REMEDY = 'give a folder with metadata.yaml that ros2 bag record wrote, or one of its files'
 _MESSAGE_LIMIT = 1 << 30    # bytes of a message, decompressed
-_BAG_FILE = re.compile(r'.*\.(mcap|db3)(\.zstd)?')
 _PIECE = 1 << 20
 _UNPACKED_LIMIT, _MOST_TIMES = 64 * 1024 * 1024, 1000      # what a whole file may become
 _ROWS = 4096                # of an SQLite file that are taken at once
@@ -60,10 +65,6 @@ _WINDOW = 128 * 1024 * 1024
 _STAMPED = {'std_msgs/msg/Header', 'builtin_interfaces/msg/Time'}
 UNKNOWN = -1
 """A stamp that a message does not have."""
-
-
-class BagError(InputError):
-    """A bag that cannot be used; its text is `FILE: what is wrong: what to do`."""
 
 
 class Stamps:
@@ -115,7 +116,7 @@ class Bag:
         for file in files:
             try:
                 with _unpacked(file) as (unpacked, kind):
-                    read = self._read_mcap if kind == _MCAP else self._read_sqlite
+                    read = self._read_mcap if kind == MCAP else self._read_sqlite
                     read(unpacked, self._called(file), topics)
             except InputError as error:
                 if len(files) == 1:
@@ -152,19 +153,19 @@ class Bag:
         path = Path(self.path)
         if not os.path.isdir(path):
             return [path]
-        names = _names_in(self.path)
-        found = sorted(path / name for name in names if _BAG_FILE.fullmatch(name))
-        what = f'{_METADATA} is missing'
-        if _METADATA in names:
+        names = names_in(self.path)
+        found = sorted(path / name for name in names if BAG_FILE.fullmatch(name))
+        what = f'{METADATA} is missing'
+        if METADATA in names:
             try:
-                files, self._stated = _named_files(path / _METADATA)
+                files, self._stated = _named_files(path / METADATA)
                 return [path / name for name in files]
             except BagError as error:
                 if not found:
                     raise
-                what = f'{_METADATA}: {error.problem}'
+                what = f'{METADATA}: {error.problem}'
         if not found:
-            raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', _REMEDY)
+            raise BagError(self.name, 'there is neither metadata.yaml nor a bag file', REMEDY)
         self.warnings.append(
             f'{self.name}: {what} (the recorder was killed): used '
             f'{counted(len(found), "bag file")} from the folder')
@@ -224,7 +225,7 @@ class Bag:
         except Exception as error:      # of SQLite, or caused by damaged data
             what = f'its SQLite storage cannot be read ({" ".join(str(error).split())})'
             if not times:
-                raise BagError(called, what, _REMEDY) from None
+                raise BagError(called, what, REMEDY) from None
             self.warnings.append(f'{called}: {what}: used {len(times)} messages before that')
         self._add_rows(known, given)
         self._look_through(times)
@@ -289,7 +290,7 @@ class Bag:
     def _give(self, topic: Topic, arrival: int, published: int, data: bytes) -> None:
         """Give a message to who keeps it."""
         if self._keep is not None and 0 <= arrival < NEVER:
-            if data.startswith(_ZSTD):
+            if data.startswith(ZSTD):
                 data = _unpacked_message(data, _MESSAGE_LIMIT)
             self._keep(topic._replace(name=_absolute(topic.name)), arrival, published, data)
 
@@ -302,7 +303,7 @@ class Bag:
         if not stamped:
             return np.full(len(heads), UNKNOWN)
         # compressed message by message
-        packed = np.flatnonzero((heads[:, :len(_ZSTD)] == np.frombuffer(_ZSTD, 'u1')).all(axis=1))
+        packed = np.flatnonzero((heads[:, :len(ZSTD)] == np.frombuffer(ZSTD, 'u1')).all(axis=1))
         if len(packed):
             heads = heads.copy()
             for number in packed.tolist():
@@ -318,45 +319,6 @@ class Bag:
                 nanoseconds < 1_000_000_000)
             found[usable] = seconds[usable] * 1_000_000_000 + nanoseconds[usable]
         return found
-
-
-def is_ordinary(path: str) -> bool:
-    """
-    Return whether a path is a bag without traced events, so without jobs.
-
-    :raises mddag_executor.trace.TraceError: if a folder cannot be read.
-    """
-    files, is_bag = [path], False
-    if os.path.isdir(path):
-        names = _names_in(path)
-        files = [os.path.join(path, name) for name in names if _BAG_FILE.fullmatch(name)]
-        is_bag = _METADATA in names     # even if its files are damaged or gone
-    found = [_trace_or_bag(file) for file in files]
-    return (is_bag or any(found)) and not any(isinstance(each, TraceReader) for each in found)
-
-
-def _names_in(folder: str) -> list[str]:
-    try:
-        return os.listdir(folder)
-    except OSError as error:
-        raise unreadable(folder, error) from None
-
-
-def opened_trace(path: str) -> TraceReader | None:
-    """Return the trace in a file; None for other files, and for damage."""
-    found = _trace_or_bag(path)
-    return found if isinstance(found, TraceReader) else None
-
-
-def _trace_or_bag(path: str) -> TraceReader | bool:
-    """Return the trace in a file, else whether it is a bag; what is left of a trace is none."""
-    try:
-        if _kind(Path(path)) != _MCAP:
-            return True
-        reader = TraceReader(path)
-        return reader if reader.written_here or reader.has_events() else True
-    except InputError:
-        return False
 
 
 def _absolute(topic: str) -> str:
@@ -387,18 +349,18 @@ def _named_files(metadata: Path) -> tuple[list[str], int | None]:
     except (OSError, ValueError, GraphError) as error:
         what = error.problem if isinstance(error, GraphError) else ' '.join(str(error).split())
         raise BagError(
-            str(metadata), f'this is no metadata of a bag ({what[:200]})', _REMEDY) from None
+            str(metadata), f'this is no metadata of a bag ({what[:200]})', REMEDY) from None
 
 
 @contextmanager
 def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
     """Yield a file, unpacked if it is compressed, and the first bytes of its kind."""
-    kind = _kind(file)
+    kind = kind_of(file)
     log = Path(f'{file}-wal')
-    if kind == _SQLITE and log.is_file() and log.stat().st_size:
+    if kind == SQLITE and log.is_file() and log.stat().st_size:
         raise BagError(str(file), f'its last messages are in {log.name} (the recorder was killed)',
                        'let ros2 bag reindex repair the bag')
-    if kind != _ZSTD:
+    if kind != ZSTD:
         yield file, kind
         return
     with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
@@ -407,12 +369,12 @@ def _unpacked(file: Path) -> Iterator[tuple[Path, bytes]]:
             with open(file, 'rb') as packed, open(target, 'wb') as out:
                 _unpack(packed, out, file)
         except zstandard.ZstdError as error:
-            raise BagError(str(file), f'cannot be unpacked ({error})', _REMEDY) from None
+            raise BagError(str(file), f'cannot be unpacked ({error})', REMEDY) from None
         except OSError as error:
             raise BagError(
                 str(file), f'cannot be unpacked into {tempfile.gettempdir()} ({error.strerror})',
                 'free space, or name another folder in TMPDIR') from None
-        yield target, _kind(target)
+        yield target, kind_of(target)
 
 
 def _unpack(packed: BinaryIO, out: BinaryIO, file: Path) -> None:
@@ -426,25 +388,8 @@ def _unpack(packed: BinaryIO, out: BinaryIO, file: Path) -> None:
             if size > most:
                 raise BagError(
                     str(file), f'unpacked it is more than {_MOST_TIMES} times as large, as no '
-                    'recording is', _REMEDY)
+                    'recording is', REMEDY)
             out.write(piece)
-
-
-def _kind(file: Path) -> bytes:
-    """Return the first bytes of a bag file, which say its kind."""
-    try:
-        if not file.is_file():
-            raise BagError(str(file), 'is no file', _REMEDY)
-        with open(file, 'rb') as stream:
-            head = stream.read(32)
-    except OSError as error:
-        raise BagError(str(file), f'cannot be read ({error.strerror})', _REMEDY) from None
-    except ValueError:
-        raise BagError(str(file), 'is no file name', _REMEDY) from None
-    for kind in (_MCAP, _SQLITE, _ZSTD):
-        if head.startswith(kind):
-            return kind
-    raise BagError(str(file), *(other_kind(head) or ('is no rosbag2 recording', _REMEDY)))
 
 
 def _unpacked_message(data: bytes, size: int) -> bytes:

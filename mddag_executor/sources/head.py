@@ -15,9 +15,9 @@ from mddag_executor.trace.errors import renamed
 from msg_graph import GraphError, loads, TaskSet
 
 TASK_SET = 'mddag:task_set'
-_RENAMED = re.compile(r'\bon_miss(?=[\'"]?\s*:)')
+_RENAMED = re.compile(r'on_miss(?<!\won_miss)(?=[\'"]?\s*:)')
 """Older name of ``on_late``, written before version 2.0."""
-_GONE = re.compile(r"(\bon_late['\"]?\s*:\s*['\"]?)abort\b")
+_GONE = re.compile(r"(on_late(?<!\won_late)['\"]?\s*:\s*['\"]?)abort\b")
 """A treatment of late jobs that version 2.0 had; rescheduled, such jobs are demoted."""
 _ABORT = 2
 """Its number in the head."""

@@ -66,7 +66,7 @@ def open_recording(
     path, reader = _opened(path)
     name = name or path
     if reader is None:
-        from mddag_executor.sources.bags import is_ordinary
+        from mddag_executor.sources.kinds import is_ordinary
         if is_ordinary(path):
             return _bag(path, task_set, name)
     with named_errors(path, name):

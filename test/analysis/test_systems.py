@@ -8,7 +8,8 @@ from mddag_executor import Replay, replay
 from mddag_executor.analysis.drafting import System
 from mddag_executor.errors import InputError
 from msg_graph import loads
-from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, LEFT_OUT, MARK
+from msg_graph.blanks import MARK
+from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, LEFT_OUT
 import pytest
 
 from ..sources.helpers import MS, Written

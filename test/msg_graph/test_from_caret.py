@@ -9,8 +9,9 @@ Declarations from CARET architecture files, made up in golden/ in CARET's format
 import re
 
 from msg_graph import GraphError, loads
+from msg_graph.blanks import MARK
 from msg_graph.caret import read_architecture
-from msg_graph.draft import declaration_of, MARK
+from msg_graph.draft import declaration_of
 import pytest
 
 from ..cli import golden

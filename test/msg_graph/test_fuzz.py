@@ -10,7 +10,7 @@ from msg_graph import GraphError, loads
 import yaml
 
 from ..conftest import examples
-from ..sources.helpers import EVERYTHING, HEAD
+from .helpers import EVERYTHING, HEAD
 
 FRAGMENTS = [
     '', '\n', ' ', '\t', ':', ': ', '-', '- ', '[', ']', '{', '}', ',', '#', '"', "'", '&a ',

@@ -14,7 +14,8 @@ from mddag_executor import open_recording, replay, ReplayError, reschedule
 from mddag_executor.errors import InputError
 from mddag_executor.simulate import START
 from mddag_executor.sources.bag_run import read_bag
-from mddag_executor.sources.bags import Bag, BagError, is_ordinary, UNKNOWN
+from mddag_executor.sources.bags import Bag, UNKNOWN
+from mddag_executor.sources.kinds import BagError, is_ordinary
 from mddag_executor.trace import blocks, times, TraceError, TraceFile
 from mddag_executor.whatif.bags_reschedule import reschedule_bag
 from msg_graph import loads
