@@ -34,7 +34,7 @@ import threading
 import time
 
 from mddag_executor import MultiDeadlineExecutor, replay
-from mddag_executor.executor.timers import TimerQueue, TimerSource
+from mddag_executor.executor.timers import TimerEntity, TimerQueue
 from msg_graph import loads
 import rclpy
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -111,7 +111,7 @@ class Run:
         """Notice every third release of the sensor late."""
         push, calls = TimerQueue._push, itertools.count(1)
 
-        def late(queue: TimerQueue, source: TimerSource, due: int) -> None:
+        def late(queue: TimerQueue, source: TimerEntity, due: int) -> None:
             if source.period() == round(self._period * 1e9) and next(calls) % 3 == 0:
                 due += round(self._long * 1e9)
             push(queue, source, due)

@@ -11,20 +11,18 @@ that it runs even if all workers wait for it.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 import os
 import signal
 import threading
 from time import monotonic_ns
-from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.executor import compat
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.loop import ChannelSource, EventLoop, Events
-from mddag_executor.executor.sources import Source
-from mddag_executor.executor.timers import Fired, TimerQueue, TimerSource
+from mddag_executor.executor.timers import Fired, TimerQueue
 from mddag_executor.executor.workers import WorkerPool
 
 
@@ -52,8 +50,7 @@ class AtOnce:
         """Handle arrivals; return whether there were any."""
         self.has_run = False
         for source in self.loop.sources(events):
-            with self.pool.lock if isinstance(source, TimerSource) else nullcontext():
-                source.collect()
+            source.collect()
         if self.timers.has_jumped or self.loop.timer.at <= monotonic_ns():
             self.loop.timer.at = NEVER
             with self.pool.lock:
@@ -82,38 +79,6 @@ class AtOnce:
             self.pool.engine.ran_at_once(entity)
 
 
-class ClockSource(Source):
-    """A subscription to simulated time."""
-
-    def __init__(self, entity: Entity, at_once: AtOnce) -> None:
-        super().__init__(
-            entity, at_once.loop, compat.message_taker(entity.rclpy), at_once.pool.fail)
-        self._at_once = at_once
-
-    def post(self, taken: Any) -> None:
-        """Set the time."""
-        self.entity.rclpy.callback(taken[0])
-        self._at_once.count(self.entity)
-
-
-class ClientSource(Source):
-    """A client: its responses complete futures, whose callbacks run in the executor."""
-
-    def __init__(self, entity: Entity, at_once: AtOnce) -> None:
-        super().__init__(
-            entity, at_once.loop, compat.response_taker(entity.rclpy), at_once.pool.fail)
-        self._at_once = at_once
-
-    def post(self, taken: Any) -> None:
-        """Complete the future of a response."""
-        header, response = taken
-        compat.complete_request(
-            self.entity.rclpy, header.request_id.sequence_number, response,
-            self._at_once.pool.outer_groups.get(self.entity.outer)
-            or self._at_once.pool.executor)
-        self._at_once.has_run = True
-
-
 class SignalPipe(ChannelSource):
     """
     Ends the wait of the main thread when a signal comes.
@@ -123,6 +88,7 @@ class SignalPipe(ChannelSource):
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.fd, self._write_fd = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     @contextmanager

@@ -267,6 +267,12 @@ def feedback_taken(waitable: Any, data: Any, most: int) -> list[tuple[Callable[.
     return found
 
 
+# --- guard conditions ----------------------------------------------------------------------------
+
+GUARD_HANDLE: Any = _rclpy.GuardCondition
+"""The class of a guard condition's handle: its method ``trigger_guard_condition`` triggers it."""
+
+
 # --- requests without a middleware (reruns) ------------------------------------------------------
 
 CLIENT_HANDLE: Any = _rclpy.ActionClient

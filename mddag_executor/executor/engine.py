@@ -64,7 +64,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.executor.bounds import GUARD_NS, GUARD_PART, MOST, SHORT_CALLBACK_NS
 from mddag_executor.executor.debugging import InvariantError
-from mddag_executor.executor.entity import Entity, SUBSCRIPTION, TIMER
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import Announced, header_stamp, Jobs, NO_ORIGIN, Origin
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.path_watch import PathWatch
@@ -586,7 +586,7 @@ class Engine:
             return rad_offset[self.tables.n_vertices]
         if entity.source >= 0:
             deadline = rad_offset[entity.source]
-            if entity.kind == TIMER or self.jobs.is_released_at_arrival(
+            if entity.is_due_at_release or self.jobs.is_released_at_arrival(
                     self.tables.dag_of[entity.source]):
                 return deadline
         else:
@@ -889,7 +889,7 @@ class Engine:
         self._work[x] = work
         entity.waiting = {x: None, **entity.waiting}
         self.to_ask_again.append(entity)
-        if 0 < entity.depth < len(entity.waiting) and entity.kind != TIMER:
+        if 0 < entity.depth < len(entity.waiting) and not entity.keeps_oldest:
             self._drop(entity, x, 'qos_depth', now)  # a newer one has arrived meanwhile
 
     def left_open(
@@ -1027,8 +1027,8 @@ class Engine:
         for entity in {work.entity for work in known.values()}:
             if any(x not in known or known[x].entity is not entity for x in entity.waiting):
                 yield f'{[*entity.waiting]} are not all executions of one entity that wait'
-            if entity.kind == SUBSCRIPTION and 0 < entity.depth < len(entity.waiting):
-                yield (f'{len(entity.waiting)} messages wait in a queue of depth '
+            if not entity.keeps_oldest and 0 < entity.depth < len(entity.waiting):
+                yield (f'{len(entity.waiting)} executions wait in a queue of depth '
                        f'{entity.depth}')
         if len(self._work) != sum(map(state.x_state.count, (WAITING, ALONE, SUSPENDED))):
             yield f'of what waits or is suspended, work is known of {sorted(self._work)} only'

@@ -1,66 +1,82 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The executor's record of each entity of rclpy: timer, subscription, service, …."""
+"""
+The executor's record of an entity of rclpy: what all kinds of callbacks have in common.
+
+Each kind is a subclass (``kinds``); engine and workers only use what is here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable as Callable_
 from collections.abc import Mapping
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.core.driven import Awaiting
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.jobs import new_address, Origin
+from mddag_executor.executor.loop import ChannelSource
 from msg_graph import Callback, TaskSet
+from msg_graph.binding import Entity as Declarable
 from msg_graph.binding import entity_name
-
-TIMER, SUBSCRIPTION, SERVICE, CLIENT, GUARD, WAITABLE, TASK = (
-    'timer', 'subscription', 'service', 'client', 'guard', 'waitable', 'task')
 
 UNKNOWN_NS = 100_000_000
 """The expected duration of a callback that has not run yet, ns."""
 
 COUNTS = (
     'ready', 'ran', 'failed', 'dropped', 'lost', 'skipped', 'unattributed', 'guessed', 'busy_ns')
-_HAVE_HANDLES = (TIMER, SUBSCRIPTION, SERVICE)
 
 
-class Entity:
+class Entity(ChannelSource):
     """
     An entity as the executor sees it.
 
-    :param rclpy: rclpy's own object.
-    :param callback: its declared callback, or None.
-    :param group: the number of its mutually exclusive callback group in the core, or -1.
-    :param depth: how many of its executions may wait; 0: any number.
+    :param rclpy: rclpy's own object; None: it has none (a task).
+    :param node: the full name of its node.
+    :cvar kind: what it is called in names, statistics and recordings.
+    :cvar is_due_at_release: whether its arrivals are the releases of its jobs (a timer's).
+    :cvar keeps_oldest: whether a new execution is skipped when too many wait (a timer's); else the
+        oldest is dropped for it.
+    :cvar at_once: whether its arrivals are handled at once (see ``at_once``).
+    :cvar names_type: whether it is named after the type of rclpy's object if it has no function.
+    :cvar is_known_to_caret: whether CARET knows such callbacks, with their callback groups.
+    :ivar declarable: what a declaration calls it; None: a declaration cannot name it.
+    :ivar callback: its declared callback, or None.
+    :ivar group: the number of its mutually exclusive callback group in the core, or -1.
+    :ivar depth: how many of its executions may wait; 0: any number.
     """
 
+    kind: ClassVar[str] = ''
+    is_due_at_release: ClassVar[bool] = False
+    keeps_oldest: ClassVar[bool] = False
+    names_type: ClassVar[bool] = True
+    at_once: ClassVar[bool] = False
+    is_known_to_caret: ClassVar[bool] = False
+
     __slots__ = (
-        'kind', 'rclpy', 'node', 'callback', 'group', 'outer', 'depth', 'label', 'source',
+        'declarable', 'rclpy', 'node', 'callback', 'group', 'outer', 'depth', 'label', 'source',
         'targets', 'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'lost',
         'skipped', 'busy_ns', 'unattributed', 'guessed', 'removed', 'may_be_gone', 'address',
         'handle', 'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns',
-        'tail_ns', 'publishes', 'at_once', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
+        'tail_ns', 'publishes', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
         'collect_more', 'counts_as_eager', 'queue', 'awaiting', 'may_answer', '__weakref__')
 
-    def __init__(
-        self, kind: str, rclpy: Any, node: str, callback: Callback | None, group: int,
-        depth: int, label: str,
-    ) -> None:
-        self.kind = kind
+    def __init__(self, rclpy: Any, node: str) -> None:
+        super().__init__()
         self.rclpy = rclpy
         self.node = node
-        self.callback = callback
-        self.group = group
+        self.declarable: Declarable | None = None
+        self.callback: Callback | None = None
+        self.group = -1
         # the number of its outer group in the core, or -1
         self.outer = -1
         # its queue in the core, if it has run without a job; else -1
         self.queue = -1
-        self.depth = depth
-        self.label = label
+        self.depth = 0
+        self.label = ''
         self.topic = ''
         # global vertex of the source that it starts, or -1
         self.source = -1
@@ -97,15 +113,13 @@ class Entity:
         self.incompatible_qos: str | None = None
         # the topics that its callback has published on
         self.publishes: set[str] = set()
-        # whether it was destroyed; whether that, or a timer's end, must be checked first
+        # whether it was destroyed; whether that, or ``is_cancelled``, must be checked first
         self.removed = False
-        self.may_be_gone = kind == TIMER
+        self.may_be_gone = False
         # whether it holds the interpreter while it runs
-        self.habit = GilHabit(None if callback is None else callback.holds_interpreter)
+        self.habit = GilHabit()
         # when the executor began to manage it, on the trace's clock: no job is due before
         self.since = 0
-        # whether it is handled at once (see ``at_once``)
-        self.at_once = False
         # how many may wait in Python, the rest stays in the middleware; 0: any number
         self.most_waiting = 0
         # called when fewer of its executions wait: the middleware may have more
@@ -118,7 +132,16 @@ class Entity:
         self.exclusive: Any = None
         self.address = new_address()
         # entered before a callback runs: it raises once the entity is destroyed
-        self.handle = rclpy.handle if kind in _HAVE_HANDLES else None
+        self.handle: Any = None
+
+    def declare(self, callback: Callback) -> None:
+        """Set its declared callback."""
+        self.callback = callback
+        self.habit = GilHabit(callback.holds_interpreter)
+
+    def is_cancelled(self) -> bool:
+        """Return whether a ready execution must not run any more; its handle is entered."""
+        return False
 
     def is_eager(self) -> bool:
         """Return whether its callback is known to wait for long, so that it starts at once."""
@@ -126,8 +149,17 @@ class Entity:
         return bool(habit.is_known and not habit.computes and self.wall_ns > SHORT_CALLBACK_NS)
 
     def may_come_from_outside(self) -> bool:
-        """Return whether its messages may not come from declared callbacks of this process."""
-        return self.callback is None or self.source >= 0 or bool(self.remote_publishers)
+        """Return whether messages may come that declared callbacks of this process do not send."""
+        return False
+
+    def record(self, say: Callable_[..., None], node: int) -> None:
+        """
+        Record it, with the tracepoints that CARET expects if it knows the kind.
+
+        :param say: records an event with its fields.
+        :param node: the address of its node.
+        """
+        say('rclcpp_callback_register', self.address, self.name)
 
     @property
     def symbol(self) -> str:
@@ -136,7 +168,7 @@ class Entity:
         while isinstance(function, functools.partial):
             function = function.func
         if function is None:
-            function = None if self.kind in (CLIENT, TASK) else type(self.rclpy)
+            function = type(self.rclpy) if self.names_type else None
         elif not hasattr(function, '__qualname__'):
             function = type(function)
         return '' if function is None else f'{function.__module__}.{function.__qualname__}'
@@ -183,11 +215,11 @@ def add_counts(counts: dict[str, dict[str, Any]], name: str, more: Mapping[str, 
         total['interpreter_share'], more['interpreter_share'], key=lambda share: share or 0.0)
 
 
-def link(entity: Entity, task_set: TaskSet, tables: Tables, topic: str) -> None:
+def link(entity: Entity, task_set: TaskSet, tables: Tables) -> None:
     """Find the vertices that an entity bound to a declared callback starts."""
     callback = entity.callback
     assert callback is not None
-    entity.topic = topic
+    topic = entity.topic
     if topic in callback.other_topics:
         entity.may_answer = True
         return

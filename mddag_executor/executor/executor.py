@@ -58,6 +58,7 @@ from mddag_executor.executor.shutdown import (
     halt_at_exit,
     is_over,
 )
+from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.statistics import statistics
 from mddag_executor.executor.statistics_types import Statistics
 from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, watched
@@ -305,6 +306,7 @@ class MultiDeadlineExecutor(BareExecutor):
     def wake(self) -> None:
         """Note that entities were created or destroyed, or that a state has changed."""
         self._upkeep.change()
+        self._wait_sets.ask_again()
         self._at_once.ring()
 
     def _signalled(self) -> None:
@@ -823,7 +825,7 @@ class MultiDeadlineExecutor(BareExecutor):
         try:
             if others is not None:
                 found += others.unmatched(
-                    [*self._registry.subscriptions()], self.get_nodes())
+                    self._registry.of_kind(SubscriptionEntity), self.get_nodes())
         except InvalidHandle:
             pass  # destroyed meanwhile
         return found

@@ -10,6 +10,7 @@ point one way.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
@@ -27,8 +28,29 @@ class Announced(Protocol):
         """Handle a message that may be of another process."""
 
 
+class Timers(Protocol):
+    """Timers by due time, to a timer: see ``timers.TimerQueue``."""
+
+    def add(self, source: Any) -> None:
+        """Add a timer."""
+
+    def remove(self, source: Any) -> None:
+        """Remove a timer."""
+
+    def ask(self, source: Any) -> None:
+        """Ask rcl when a timer is due next."""
+
+    def fire(self, source: Any) -> None:
+        """Call a timer whose time has come, if rcl reports it due."""
+
+
 class Hall(Protocol):
-    """The worker pool, to a source: see ``workers.WorkerPool``."""
+    """
+    The worker pool, to a source: see ``workers.WorkerPool``.
+
+    :ivar deferred: functions to call when the calling thread does not own the lock.
+    :ivar outer_groups: the executors for done callbacks of outer groups, by their numbers.
+    """
 
     engine: Engine
     clock: TraceClock
@@ -36,9 +58,27 @@ class Hall(Protocol):
     announcements: Announced | None
     fail: Callable[[BaseException], None]
     now: int
+    lock: Any
+    context: Any
+    deferred: deque[Callable[[], None]]
+    outer_groups: dict[int, Any]
+
+    @property
+    def timers(self) -> Timers:
+        """Return its timers."""
+
+    @property
+    def executor(self) -> Spinner | None:
+        """Return the executor; None: it has been destroyed."""
 
     def tick(self) -> int:
         """Return the engine's time now."""
+
+    def post(self, several: list[Work]) -> None:
+        """Make undeclared executions ready."""
+
+    def call_at(self, at: int, function: Callable[[], None]) -> None:
+        """Let a worker thread call a function at a time (monotonic ns), without the lock."""
 
 
 class Spinner(Protocol):

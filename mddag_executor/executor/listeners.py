@@ -26,6 +26,7 @@ import ctypes
 from functools import cache
 import os
 import platform
+import threading
 import time
 from typing import Any
 
@@ -52,6 +53,9 @@ _SETTERS = {
     'event': 'rcl_event_set_callback',
     'timer': 'rcl_timer_set_on_reset_callback',
 }
+# rcl has no listener for guard conditions: their trigger is wrapped (``publishing``)
+_GUARDS: dict[int, tuple[int, ...]] = {}
+_guards_lock = threading.Lock()
 
 
 def _setter(name: str) -> Any:
@@ -85,19 +89,35 @@ def set_listener(kind: str, address: int, fd: int) -> None:
 
     Earlier arrivals count as well: the descriptor becomes readable at once, with ``MANY``.
 
-    :param kind: ``subscription``, ``service``, ``client``, ``event`` or ``timer``.
+    :param kind: ``subscription``, ``service``, ``client``, ``event``, ``timer`` or
+        ``guard_condition``.
     :param address: of the rcl entity, which must not be destroyed meanwhile.
     :raises ListenerError: when the middleware has no listener for such an entity.
     """
-    if _SET[kind](address, _WRITE, fd) != 0:
+    if kind == 'guard_condition':
+        with _guards_lock:
+            _GUARDS[address] = (*_GUARDS.get(address, ()), fd)
+    elif _SET[kind](address, _WRITE, fd) != 0:
         raise ListenerError(f'{kind}: the middleware cannot announce what arrives: use another '
                             'RMW_IMPLEMENTATION')
     announce(fd, MANY)
 
 
-def clear_listener(kind: str, address: int) -> None:
+def clear_listener(kind: str, address: int, fd: int) -> None:
     """Stop the middleware from writing for an entity; it does not write after this returns."""
-    _SET[kind](address, None, None)
+    if kind != 'guard_condition':
+        _SET[kind](address, None, None)
+        return
+    with _guards_lock:
+        rest = tuple(each for each in _GUARDS.pop(address, ()) if each != fd)
+        if rest:
+            _GUARDS[address] = rest
+
+
+def announce_trigger(address: int) -> None:
+    """Write for a guard condition that has been triggered; also in a signal handler."""
+    for fd in _GUARDS.get(address, ()):
+        announce(fd)
 
 
 def new_eventfd() -> int:

@@ -65,8 +65,11 @@ class ChannelSource:
     :ivar is_counted: the descriptor is not shared, so its count is the number of arrivals.
     """
 
-    fd = -1
-    is_counted = False
+    __slots__ = ('fd', 'is_counted')
+
+    def __init__(self) -> None:
+        self.fd = -1
+        self.is_counted = False
 
     def collect(self) -> None:
         """Collect the arrivals."""
@@ -146,10 +149,6 @@ class EventLoop:
         self._epoll.unregister(fd)
         self._shared = {name: each for name, each in self._shared.items() if each != fd}
         self._free.append(fd)
-
-    def has(self, source: ChannelSource) -> bool:
-        """Return whether a source is one of this loop."""
-        return source in self._channels.get(source.fd, ())
 
     def hold(self, sources: Iterable[ChannelSource]) -> None:
         """Stop wake-ups for some sources until ``release``; from any thread, without the lock."""

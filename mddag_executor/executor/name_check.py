@@ -18,7 +18,6 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from mddag_executor.executor.entity import SERVICE, SUBSCRIPTION, TIMER
 from mddag_executor.text import counted, listed
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import is_background, suggest_entity
@@ -89,7 +88,7 @@ def unbound_text(task_set: TaskSet, missing: list[Callback], registry: Registry)
     text = f'{task_set.file}: {found} found in no node: {listed(names)}'
     ran = sorted({entity.name for entity in registry.by_id.values()
                   if entity.callback is None and entity.ran and not entity.is_own
-                  and entity.kind in (TIMER, SUBSCRIPTION, SERVICE)
+                  and entity.declarable is not None
                   and not is_background(entity.label, entity.node)})
     if ran:
         text += f'; undeclared callbacks that ran: {listed(ran)}'

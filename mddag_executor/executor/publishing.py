@@ -1,12 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Wraps three methods of rclpy, so that the executor knows when a program calls them.
+Wraps four methods of rclpy, so that the executor knows when a program calls them.
 
 Theory of operation
 -------------------
-``Publisher.publish``, ``Client.call`` and ``Subscription.set_content_filter`` are wrapped once for
-the process, when the first executor is made.
+``Publisher.publish``, ``Client.call``, ``Subscription.set_content_filter`` and the trigger of
+guard conditions are wrapped once for the process, when the first executor is made.
 
 1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
 2.  *A publication on a trigger topic* is noted, so that its messages find their job (``jobs``).
@@ -21,6 +21,8 @@ the process, when the first executor is made.
     message to a worker.
 5.  *A new content filter* makes rmw_fastrtps replace the subscription's reader, which loses the
     listener (rclpy from 7.1.8 on).  So the listener is set again.
+6.  *A triggered guard condition* is announced like a message, because rcl has no listener for it.
+    The method of its handle is wrapped, which also those call that have no ``GuardCondition``.
 
 The methods are unchanged outside of callbacks of this executor, on topics without a subscription
 of an executor here.
@@ -31,7 +33,9 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+from mddag_executor.executor.compat import GUARD_HANDLE
 from mddag_executor.executor.jobs import NO_ORIGIN, Publication, PublisherState
+from mddag_executor.executor.listeners import announce_trigger
 from mddag_executor.executor.work import current
 from rclpy.client import Client
 from rclpy.publisher import Publisher
@@ -42,7 +46,7 @@ class LocalDelivery:
     """
     The subscriptions on one topic that publishing threads of this process take from.
 
-    :param sources: their sources (``sources.SubscriptionSource``).
+    :param sources: the subscriptions (``sources.SubscriptionEntity``).
     :param pool: the ``WorkerPool``.
     """
 
@@ -64,8 +68,8 @@ class LocalDelivery:
     def listen_again(self, subscription: Any) -> None:
         """Announce a subscription again after the middleware has replaced its reader."""
         for source in self.sources:
-            if source.entity.rclpy is subscription:
-                source.listen()
+            if source.rclpy is subscription:
+                source.listen_again()
 
     def collect_published(self, publication: Publication | None) -> None:
         """Collect arrivals announced since ``hold``, and resume announcements."""
@@ -90,6 +94,36 @@ _STATE = '_mddag_publisher_state'
 _deliveries: dict[str, tuple[LocalDelivery, ...]] = {}
 _lock = threading.Lock()
 _installed = False
+
+
+class Deliveries:
+    """
+    The subscriptions of an executor that publishing threads of this process take from.
+
+    :param pool: the ``WorkerPool``.
+    """
+
+    def __init__(self, pool: Any) -> None:
+        self._pool = pool
+        self._by_topic: dict[str, LocalDelivery] = {}
+
+    def add(self, source: Any) -> None:
+        """Let publishing threads take from a subscription."""
+        before = self._by_topic.get(source.label)
+        self._set(source.label, (*(before.sources if before else ()), source))
+
+    def remove(self, source: Any) -> None:
+        """End ``add``; does nothing for other subscriptions."""
+        before = self._by_topic.get(source.label)
+        if before is not None and source in before.sources:
+            self._set(
+                source.label, tuple(each for each in before.sources if each is not source))
+
+    def _set(self, topic: str, sources: tuple[Any, ...]) -> None:
+        new = LocalDelivery(sources, self._pool) if sources else None
+        replace_delivery(topic, self._by_topic.pop(topic, None), new)
+        if new is not None:
+            self._by_topic[topic] = new
 
 
 def replace_delivery(topic: str, old: LocalDelivery | None, new: LocalDelivery | None) -> None:
@@ -150,6 +184,7 @@ def install() -> None:
     send = Publisher.publish
     call = Client.call
     set_filter = getattr(Subscription, 'set_content_filter', None)
+    trigger = GUARD_HANDLE.trigger_guard_condition
 
     def publish(self: Any, msg: Any) -> None:
         state = self.__dict__.get(_STATE) or state_of(self)
@@ -181,10 +216,16 @@ def install() -> None:
         for delivery in _deliveries.get(self.topic_name, ()):
             delivery.listen_again(self)
 
+    def trigger_and_announce(self: Any) -> None:
+        trigger(self)
+        announce_trigger(self.pointer)
+
     publish.__doc__ = send.__doc__
     call_and_wait.__doc__ = call.__doc__
     Publisher.publish = publish  # type: ignore[method-assign]
     Client.call = call_and_wait  # type: ignore[method-assign]
+    trigger_and_announce.__doc__ = trigger.__doc__
+    GUARD_HANDLE.trigger_guard_condition = trigger_and_announce
     if set_filter is not None:
         set_content_filter.__doc__ = set_filter.__doc__
         Subscription.set_content_filter = set_content_filter  # type: ignore[attr-defined]

@@ -13,7 +13,7 @@ import weakref
 from mddag_executor import defaults
 from mddag_executor.clocks import boot, TraceClock
 from mddag_executor.core.tables import ON_LATE
-from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION, TIMER
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.publishing import state_of
 from mddag_executor.trace.errors import TraceError
 from msg_graph import TaskSet
@@ -61,7 +61,7 @@ class Recorder:
     def _say(self, event: str, *fields: Any) -> None:
         self.record(event, self._clock.now(), threading.get_native_id(), *fields)
 
-    def entities(self, nodes: Iterable[Any], added: list[Entity]) -> None:
+    def entities(self, nodes: Iterable[Any], added: Iterable[Entity]) -> None:
         """Record new nodes, publishers and entities, with the tracepoints CARET expects."""
         by_name: dict[str, int] = {}
         for node in nodes:
@@ -92,22 +92,9 @@ class Recorder:
                     publisher.topic_name, publisher.qos_profile.depth)
 
     def _entity(self, entity: Entity, node: int) -> None:
-        handle = id(entity.rclpy)
-        if entity.kind == TIMER:
-            self._say('rcl_timer_init', handle, entity.rclpy.timer_period_ns)
-            self._say('rclcpp_timer_callback_added', handle, entity.address)
-            self._say('rclcpp_timer_link_node', handle, node)
-        elif entity.kind == SUBSCRIPTION:
-            self._say('rcl_subscription_init', handle, node, handle, entity.label, entity.depth)
-            self._say('rclcpp_subscription_init', handle, handle)
-            self._say('rclcpp_subscription_callback_added', handle, entity.address)
-        elif entity.kind == SERVICE:
-            self._say('rcl_service_init', handle, node, handle, entity.label)
-            self._say('rclcpp_service_callback_added', handle, entity.address)
-        else:
-            self._say('rclcpp_callback_register', entity.address, entity.name)
+        entity.record(self._say, node)
+        if not entity.is_known_to_caret:
             return
-        self._say('rclcpp_callback_register', entity.address, entity.symbol)
         group = getattr(entity.rclpy, 'callback_group', None)
         if group is not None and group not in self._known:
             self._known.add(group)
@@ -115,7 +102,7 @@ class Recorder:
             kind = 'mutually_exclusive' if exclusive else 'reentrant'
             self._say('add_callback_group', id(self), id(group), kind)
         if group is not None:
-            self._say(f'callback_group_add_{entity.kind}', id(group), handle)
+            self._say(f'callback_group_add_{entity.kind}', id(group), id(entity.rclpy))
 
     def close(self, now: int, end: int | None = None) -> None:
         """

@@ -7,41 +7,42 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from functools import partial
 import threading
-from typing import Any
+from typing import Any, TypeVar
 import weakref
 
 from mddag_executor.core.jobs import source_depth
-from mddag_executor.executor.bounds import MOST, REMEMBERED
-from mddag_executor.executor.compat import keeps_time, service_name
+from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import (
-    CLIENT,
-    COUNTS,
-    Entity,
-    GUARD,
-    link,
-    SERVICE,
-    SUBSCRIPTION,
-    TIMER,
-    WAITABLE,
+from mddag_executor.executor.entity import COUNTS, link
+from mddag_executor.executor.kinds import Kind
+from mddag_executor.executor.sources import (
+    ClientEntity,
+    ClockEntity,
+    ServiceEntity,
+    SubscriptionEntity,
 )
-from mddag_executor.executor.sources import SERVICE_DEPTH
+from mddag_executor.executor.timers import TimerEntity
+from mddag_executor.executor.waitables import EventEntity, GuardEntity, WaitableEntity
 from mddag_executor.executor.work import decides_itself, step_in_group, Work
 from msg_graph import binding, Callback, TaskSet
-from msg_graph.duration import exact_duration
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, qos_policy_name_from_kind
+from rclpy.qos import qos_policy_name_from_kind
 
-LISTS = {
-    'timers': TIMER, 'subscriptions': SUBSCRIPTION, 'services': SERVICE, 'clients': CLIENT,
-    'guards': GUARD, 'waitables': WAITABLE}
-"""The kinds of a node's entities, by the names of its properties."""
+KINDS: tuple[type[Kind], ...] = (
+    TimerEntity, ClockEntity, SubscriptionEntity, ServiceEntity, ClientEntity, GuardEntity,
+    EventEntity, WaitableEntity)
+"""The kinds of a node's entities; an entity is of the first one that fits."""
+
+LISTS = tuple(dict.fromkeys(kind.list_name for kind in KINDS))
+"""The properties of a node that list its entities."""
 
 EntitySet = dict[Node, tuple[list[Any], ...]]
 """The entities of each node, for each of ``LISTS``, in the order of creation."""
+
+SomeKind = TypeVar('SomeKind', bound=Kind)
 
 
 def snapshot(nodes: Iterable[Node]) -> EntitySet:
@@ -91,11 +92,11 @@ class Registry:
         #: the outer groups of nodes
         self.outer_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
         self._counting = threading.Lock()
-        self.by_id: dict[int, Entity] = {}
+        self.by_id: dict[int, Kind] = {}
         # the executor's own subscriptions
         self.own: set[Any] = set()
         # destroyed entities with unfinished executions, and the counts of earlier ones
-        self._retired: list[Entity] = []
+        self._retired: list[Kind] = []
         self._past: dict[str, dict[str, Any]] = {}
         # by declared callback: the topics that its entities, also removed ones, have published
         # (they share the set), and have got messages of
@@ -109,9 +110,9 @@ class Registry:
         """Return the declared callbacks."""
         return self._task_set.callbacks if self._task_set is not None else ()
 
-    def refresh(self, found: EntitySet) -> tuple[list[Entity], list[Entity]]:
+    def refresh(self, found: EntitySet) -> tuple[list[Kind], list[Kind]]:
         """Update the entities to those that the nodes have now; return new and removed ones."""
-        present: dict[int, Entity] = {}
+        present: dict[int, Kind] = {}
         new: list[tuple[str, Any, str, int]] = []
         for node, lists in found.items():
             try:
@@ -120,12 +121,12 @@ class Registry:
                 continue  # destroyed after it was listed
             group = self.outer_groups.get(node)
             outer = -1 if group is None else group.number
-            for kind, some in zip(LISTS.values(), lists):
+            for list_name, some in zip(LISTS, lists):
                 for rclpy_entity in some:
                     key = id(rclpy_entity)
                     entity = self.by_id.get(key)
                     if entity is None or entity.rclpy is not rclpy_entity:
-                        new.append((kind, rclpy_entity, name, outer))
+                        new.append((list_name, rclpy_entity, name, outer))
                     else:
                         present[key] = entity
                         if entity.outer != outer:
@@ -171,7 +172,7 @@ class Registry:
                 self._note_received(entity)
             return {c.key: set(self._received[c.key]) for c in self.declared if c.kind == 'sync'}
 
-    def _note_received(self, entity: Entity) -> None:
+    def _note_received(self, entity: Kind) -> None:
         if entity.callback is not None and entity.ready:
             self._received[entity.callback.key].add(entity.topic)
 
@@ -212,72 +213,65 @@ class Registry:
         """Return all undeclared timers, subscriptions and services, including removed ones."""
         return list(self._undeclared)
 
-    def subscriptions(self) -> list[Entity]:
-        """Return the current subscriptions."""
-        return [entity for entity in self.by_id.values() if entity.kind == SUBSCRIPTION]
+    def of_kind(self, kind: type[SomeKind]) -> list[SomeKind]:
+        """Return the current entities of a kind."""
+        return [entity for entity in list(self.by_id.values()) if isinstance(entity, kind)]
 
     def note_event(self, handler: EventHandler, status: Any) -> None:
         """Note a QoS event: the policy because of which a subscription gets no messages."""
         incompatible = QoSSubscriptionEventType.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS
         if status is None or handler.event_type != incompatible:
             return
-        for entity in self.subscriptions():
+        for entity in self.of_kind(SubscriptionEntity):
             if handler in entity.rclpy.event_handlers:
                 entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
-    def timers(self) -> list[Entity]:
-        """Return the current timers."""
-        return [entity for entity in self.by_id.values() if entity.kind == TIMER]
-
     def _new_entity(
-        self, kind: str, rclpy_entity: Any, node: str, outer: int
-    ) -> Entity | None:
-        callback, topic, depth, label, period = None, '', 0, '', None
+        self, list_name: str, rclpy_entity: Any, node: str, outer: int
+    ) -> Kind | None:
+        kind = next(each for each in KINDS
+                    if each.list_name == list_name and each.fits(rclpy_entity))
         try:
-            if kind == TIMER:
-                period = rclpy_entity.timer_period_ns
-                depth, label = 1, exact_duration(period)
-            elif kind == SUBSCRIPTION:
-                topic = label = rclpy_entity.topic_name
-                qos = rclpy_entity.qos_profile
-                depth = qos.depth if qos.history == HistoryPolicy.KEEP_LAST else 0
-            elif kind in (SERVICE, CLIENT):
-                label = service_name(rclpy_entity)
-            elif kind == GUARD:
-                label = 'condition'
+            entity = kind(rclpy_entity, node)
+            entity.describe()
         except InvalidHandle:
             return None  # destroyed after it was listed
-        bindable = binding.Entity(node, kind, '' if kind == TIMER else label, period)
-        if kind in (TIMER, SUBSCRIPTION, SERVICE) and self._binder is not None:
-            callback = self._binder.bind(bindable)
+        entity.outer = outer
+        entity.is_own = rclpy_entity in self.own
+        self._set_group(entity)
+        self._bind(entity)
+        return entity
+
+    def _set_group(self, entity: Kind) -> None:
+        """Set the callback group of a new entity."""
+        rclpy_entity = entity.rclpy
         group = getattr(rclpy_entity, 'callback_group', None)
         decides = group is not None and decides_itself(group)
-        number = self._number(rclpy_entity if decides else group)
-        entity = Entity(kind, rclpy_entity, node, callback, number, depth, label)
-        entity.outer = outer
+        entity.group = self._number(rclpy_entity if decides else group)
         if decides:
             entity.gate = partial(step_in_group, group, rclpy_entity, self._passed)
-        elif group is not None and number >= 0 and group.has_entity(rclpy_entity):
+        elif group is not None and entity.group >= 0 and group.has_entity(rclpy_entity):
             entity.exclusive = group
-        if kind == SUBSCRIPTION and depth == 0:
-            entity.most_waiting = MOST
-        elif kind == SERVICE:
-            entity.most_waiting = SERVICE_DEPTH
-        entity.is_own = rclpy_entity in self.own
-        entity.at_once = callback is None and kind == SUBSCRIPTION and keeps_time(rclpy_entity)
-        if callback is None and kind in (TIMER, SUBSCRIPTION, SERVICE) and not entity.is_own:
-            if len(self._undeclared) < REMEMBERED:
-                self._undeclared[bindable] = None
-        if callback is not None:
-            assert self._task_set is not None
-            link(entity, self._task_set, self._tables, topic)
-            entity.awaiting = self._engine.awaiting.get(callback.key)
-            entity.publishes = self._published[callback.key]
-            if kind == TIMER and entity.source >= 0:
-                scheduler = self._engine.scheduler
-                entity.depth = source_depth(
-                    scheduler.tables, scheduler.state, self._tables.dag_of[entity.source])
-        return entity
+
+    def _bind(self, entity: Kind) -> None:
+        """Bind a new entity to its declared callback, if there is one."""
+        declarable = entity.declarable
+        if declarable is None:
+            return
+        callback = None if self._binder is None else self._binder.bind(declarable)
+        if callback is None:
+            if not entity.is_own and len(self._undeclared) < REMEMBERED:
+                self._undeclared[declarable] = None
+            return
+        assert self._task_set is not None
+        entity.declare(callback)
+        link(entity, self._task_set, self._tables)
+        entity.awaiting = self._engine.awaiting.get(callback.key)
+        entity.publishes = self._published[callback.key]
+        if entity.is_due_at_release and entity.source >= 0:
+            scheduler = self._engine.scheduler
+            entity.depth = source_depth(
+                scheduler.tables, scheduler.state, self._tables.dag_of[entity.source])
 
     def _number(self, group: Any) -> int:
         """Return the core's number of a callback group, -1 for a reentrant one and for none."""
@@ -296,6 +290,6 @@ class Registry:
                 self._numbers.remove(number)
                 self._engine.scheduler.free_group(number)
 
-    def _unbind(self, entity: Entity) -> None:
+    def _unbind(self, entity: Kind) -> None:
         if self._binder is not None and entity.callback is not None:
             self._binder.release(entity.callback, entity.topic or None)

@@ -3,10 +3,13 @@
 """
 Collect messages, requests and responses from entities, and make work of them.
 
-A source belongs to one entity.  It has a descriptor to which the middleware writes at each arrival
-(``loop``); ``collect`` then takes what has arrived.  Messages and requests are taken under the
-engine's lock, so they stay in order whichever thread takes them.  This costs no parallelism,
-because rclpy keeps the GIL while it takes.
+The middleware writes to the descriptor of an entity at each arrival (``loop``); ``collect`` then
+takes what has arrived.  Messages and requests are taken under the engine's lock, so they stay in
+order whichever thread takes them.  This costs no parallelism, because rclpy keeps the GIL while it
+takes.
+
+Responses complete futures, and messages on ``/clock`` set simulated time.  The spinning thread
+takes both, because callbacks may wait for them (``at_once``).
 
 Anything beyond a bound stays in the middleware: requests beyond ``SERVICE_DEPTH``, and messages
 beyond ``MOST`` if the QoS profile keeps all.  These are collected when a waiting one starts
@@ -21,56 +24,28 @@ from typing import Any
 
 from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import MOST
-from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gaps import Gaps
-from mddag_executor.executor.hall import Hall
 from mddag_executor.executor.jobs import Publication, stamped_release
-from mddag_executor.executor.listeners import clear_listener, MANY, set_listener, take_count
-from mddag_executor.executor.loop import ChannelSource, EventLoop
+from mddag_executor.executor.kinds import ListenerEntity, Rooms
+from mddag_executor.executor.listeners import MANY, set_listener, take_count
 from mddag_executor.executor.work import Work
-from rclpy.exceptions import InvalidHandle
+from msg_graph.binding import Entity as Declarable
+from rclpy.qos import HistoryPolicy
 
 SERVICE_DEPTH = 10
 """How many requests wait in Python at most: the depth of rclpy's default profile for services."""
 
 
-class EntitySource(ChannelSource):
-    """An entity with a listener."""
-
-    def __init__(self, entity: Entity) -> None:
-        self.entity = entity
-        self.handle: Any = entity.rclpy.handle
-
-    def listen(self) -> None:
-        """Let the middleware announce arrivals; raise InvalidHandle if the entity is destroyed."""
-        with self.handle:
-            set_listener(self.entity.kind, self.handle.pointer, self.fd)
-
-    def ignore(self) -> None:
-        """End ``listen``."""
-        try:
-            with self.handle:
-                clear_listener(self.entity.kind, self.handle.pointer)
-        except InvalidHandle:
-            pass  # it is just being destroyed
-
-
-class Source(EntitySource):
+class ArrivalEntity(ListenerEntity):
     """
     An entity at which messages, requests or responses arrive.
 
-    :param take: takes one arrival and returns it; None: there is none.
-    :param fail: receives the exceptions of takes.
+    Its kind sets, before it listens, how one arrival is taken (``_take``; None: there is none).
     """
 
-    def __init__(
-        self, entity: Entity, loop: EventLoop, take: Callable[[], Any],
-        fail: Callable[[BaseException], None],
-    ) -> None:
-        super().__init__(entity)
-        self._loop = loop
-        self._take = take
-        self._fail = fail
+    __slots__ = ('_take',)
+
+    _take: Callable[[], Any]
 
     def collect(self, left: int = 0) -> None:
         """
@@ -78,17 +53,17 @@ class Source(EntitySource):
 
         :param left: how many at most; 0: those announced since the last call.
         """
-        entity, take = self.entity, self._take
+        take = self._take
         try:
             if not left:
                 left = take_count(self.fd) if self.is_counted else MANY
                 if not left:
                     return  # another thread has collected it
-            if entity.removed:
+            if self.removed:
                 return  # another executor may have it now
             for _ in range(left if left < MOST else MOST):
-                if 0 < entity.most_waiting <= len(entity.waiting):
-                    entity.collect_more = partial(self.collect, MANY)
+                if 0 < self.most_waiting <= len(self.waiting):
+                    self.collect_more = partial(self.collect, MANY)
                     return
                 left -= 1
                 taken = take()
@@ -96,39 +71,76 @@ class Source(EntitySource):
                     return
                 self.post(taken)
         except compat.RCL_ERRORS as error:
-            if not compat.alive(entity.rclpy):
+            if not compat.alive(self.rclpy):
                 return
-            self._fail(error)
+            self.rooms.pool.fail(error)
         except Exception as error:
             if self.fd < 0:
                 return  # it was just removed
-            self._fail(error)
+            self.rooms.pool.fail(error)
         if left:
-            self._loop.announce(self, left)
+            self.loop.announce(self, left)
 
     def post(self, taken: Any) -> None:
         """Handle an arrival."""
         raise NotImplementedError
 
 
-class SubscriptionSource(Source):
-    """
-    A subscription.
+class SubscriptionEntity(ArrivalEntity):
+    """A subscription."""
 
-    :param publishers: returns the ids of the publishers of a subscription (see ``gaps``).
-    """
+    kind = 'subscription'
+    list_name = 'subscriptions'
+    is_known_to_caret = True
 
-    def __init__(
-        self, entity: Entity, pool: Hall,
-        publishers: Callable[[Any], frozenset[bytes] | None],
-    ) -> None:
-        super().__init__(entity, pool.loop, compat.message_taker(entity.rclpy), pool.fail)
-        self._pool = pool
+    __slots__ = ('_gaps', '_with_info', '_is_plain')
+
+    def describe(self) -> None:
+        """Set label, depth and whatever else does not change."""
+        self.topic = self.label = self.rclpy.topic_name
+        qos = self.rclpy.qos_profile
+        if qos.history == HistoryPolicy.KEEP_LAST:
+            self.depth = qos.depth
+        else:
+            self.most_waiting = MOST
+        self.declarable = Declarable(self.node, self.kind, self.topic)
+
+    def may_come_from_outside(self) -> bool:
+        """Return whether messages may come that declared callbacks of this process do not send."""
+        return self.callback is None or self.source >= 0 or bool(self.remote_publishers)
+
+    def listen(self, rooms: Rooms) -> None:
+        """Let messages be collected, also by publishing threads of this process."""
+        subscription, pool = self.rclpy, rooms.pool
+        if compat.is_of_wait_for_message(subscription):
+            return
+        self._take = compat.message_taker(subscription)
         self._gaps = Gaps(
-            partial(publishers, entity.rclpy), partial(compat.publisher_count, entity.rclpy))
-        self._with_info = compat.callback_type(entity.rclpy) is compat.WITH_INFO
-        self._is_plain = (
-            pool.engine.record is None and entity.callback is None and not entity.is_own)
+            partial(rooms.publishers, subscription), partial(compat.publisher_count, subscription))
+        self._with_info = compat.callback_type(subscription) is compat.WITH_INFO
+        self._is_plain = pool.engine.record is None and self.callback is None and not self.is_own
+        self.listen_in(rooms, pool.loop)
+        if self.is_counted:
+            rooms.deliveries.add(self)
+
+    def ignore(self) -> None:
+        """End ``listen``."""
+        if self.fd >= 0:
+            self.rooms.deliveries.remove(self)
+        super().ignore()
+
+    def listen_again(self) -> None:
+        """Set the listener again after the middleware has replaced the reader."""
+        with self.handle:
+            set_listener(self.kind, self.handle.pointer, self.fd)
+
+    def record(self, say: Callable[..., None], node: int) -> None:
+        """Record it with CARET's tracepoints."""
+        handle = id(self.rclpy)
+        say('rcl_subscription_init', handle, node, handle, self.label, self.depth)
+        say('rclcpp_subscription_init', handle, handle)
+        say('rclcpp_subscription_callback_added', handle, self.address)
+        say('rclcpp_callback_register', self.address, self.symbol)
 
     def post(self, taken: Any, publication: Publication | None = None) -> None:
         """
@@ -136,13 +148,13 @@ class SubscriptionSource(Source):
 
         :param publication: the one that has just sent it, if certain.
         """
-        entity, pool, gaps = self.entity, self._pool, self._gaps
+        pool, gaps = self.rooms.pool, self._gaps
         number = taken[1].get('publication_sequence_number')
         if number == gaps.expected:
             gaps.expected += 1
         elif missing := gaps.missing(number):
-            pool.engine.never_taken(entity, missing, pool.now)
-        work = Work(entity, entity.rclpy.callback, taken if self._with_info else (taken[0],))
+            pool.engine.never_taken(self, missing, pool.now)
+        work = Work(self, self.rclpy.callback, taken if self._with_info else (taken[0],))
         if self._is_plain:
             pool.engine.ready(work, pool.now)
         else:
@@ -152,32 +164,33 @@ class SubscriptionSource(Source):
         self, work: Work, info: dict[str, Any], publication: Publication | None
     ) -> None:
         """Report a message that is recorded, or may belong to a job, or is the executor's own."""
-        entity, engine = self.entity, self._pool.engine
-        if entity.is_own:
+        pool = self.rooms.pool
+        engine = pool.engine
+        if self.is_own:
             work.function(*work.args)
             return
         message, stamp = work.args[0], info['source_timestamp']
-        now = self._pool.now
+        now = pool.now
         if engine.record is not None:
-            now = self._pool.tick()  # it becomes ready right after it was taken
+            now = pool.tick()  # it becomes ready right after it was taken
             engine.taken(
-                entity, message, stamp, info.get('publication_sequence_number'), now)
-        if entity.callback is None:
+                self, message, stamp, info.get('publication_sequence_number'), now)
+        if self.callback is None:
             engine.ready(work, now)
             return
-        if entity.awaits and publication is None and self._pool.announcements is not None:
-            self._pool.announcements.take(work, info, now)
+        if self.awaits and publication is None and pool.announcements is not None:
+            pool.announcements.take(work, info, now)
             return
         origin = None
         release = header = -1
-        if entity.source >= 0:
+        if self.source >= 0:
             release, header = engine.jobs.release(
-                engine.tables.dag_of[entity.source], message, stamp, now, self._pool.clock)
-        elif entity.targets:
+                engine.tables.dag_of[self.source], message, stamp, now, pool.clock)
+        elif self.targets:
             origin = publication.origin if publication is not None else engine.jobs.find(
-                entity.topic, stamp, info.get('publication_sequence_number'))
-            if origin is None and entity.remote_publishers:
-                release, header = stamped_release(message, self._pool.clock)
+                self.topic, stamp, info.get('publication_sequence_number'))
+            if origin is None and self.remote_publishers:
+                release, header = stamped_release(message, pool.clock)
         engine.arrived(work, origin, release, header, now)
 
     def collect_published(self, publication: Publication | None) -> bool:
@@ -192,7 +205,7 @@ class SubscriptionSource(Source):
         announced = take_count(self.fd)
         if not announced:
             return False  # nothing was announced, or it was just removed
-        if announced > 1 or self.entity.most_waiting:
+        if announced > 1 or self.most_waiting:
             self.collect(announced)
             return True
         try:
@@ -213,23 +226,109 @@ class SubscriptionSource(Source):
         return True
 
 
-class ServiceSource(Source):
+class ClockEntity(SubscriptionEntity):
+    """The subscription of a node to simulated time, which rclpy makes: no declaration means it."""
+
+    at_once = True
+
+    __slots__ = ()
+
+    @classmethod
+    def fits(cls, rclpy_object: Any) -> bool:
+        """Return whether a subscription is of this kind."""
+        return compat.keeps_time(rclpy_object)
+
+    def describe(self) -> None:
+        """Set label, depth and whatever else does not change."""
+        super().describe()
+        self.declarable = None
+
+    def listen(self, rooms: Rooms) -> None:
+        """Let the spinning thread collect messages."""
+        self._take = compat.message_taker(self.rclpy)
+        self.listen_in(rooms, rooms.at_once.loop)
+
+    def ignore(self) -> None:
+        """End ``listen``."""
+        ListenerEntity.ignore(self)
+
+    def post(self, taken: Any, publication: Publication | None = None) -> None:
+        """Set simulated time."""
+        self.rclpy.callback(taken[0])
+        self.rooms.at_once.count(self)
+
+
+class ServiceEntity(ArrivalEntity):
     """A service."""
 
-    def __init__(self, entity: Entity, pool: Hall) -> None:
-        super().__init__(entity, pool.loop, compat.request_taker(entity.rclpy), pool.fail)
-        self._pool = pool
+    kind = 'service'
+    list_name = 'services'
+    is_known_to_caret = True
+
+    __slots__ = ()
+
+    def describe(self) -> None:
+        """Set label, depth and whatever else does not change."""
+        self.label = compat.service_name(self.rclpy)
+        self.most_waiting = SERVICE_DEPTH
+        self.declarable = Declarable(self.node, self.kind, self.label)
+
+    def may_come_from_outside(self) -> bool:
+        """Return whether requests may come that declared callbacks of this process do not send."""
+        return self.callback is None or self.source >= 0 or bool(self.remote_publishers)
+
+    def listen(self, rooms: Rooms) -> None:
+        """Let requests be collected; the built-in services of a node share a descriptor."""
+        self._take = compat.request_taker(self.rclpy)
+        self.listen_in(rooms, rooms.pool.loop,
+                       f'services {self.node}' if compat.is_builtin(self.rclpy) else '')
+
+    def record(self, say: Callable[..., None], node: int) -> None:
+        """Record it with CARET's tracepoints."""
+        handle = id(self.rclpy)
+        say('rcl_service_init', handle, node, handle, self.label)
+        say('rclcpp_service_callback_added', handle, self.address)
+        say('rclcpp_callback_register', self.address, self.symbol)
 
     def post(self, taken: Any) -> None:
         """Report a request to the engine."""
         request, header = taken
-        service, engine = self.entity.rclpy, self._pool.engine
+        service, pool = self.rclpy, self.rooms.pool
+        engine = pool.engine
         # a recording tells requests apart by the time at which they became ready
-        now = self._pool.now if engine.record is None else self._pool.tick()
+        now = pool.now if engine.record is None else pool.tick()
         work = Work(
-            self.entity, service.callback, (request, service.srv_type.Response()),
+            self, service.callback, (request, service.srv_type.Response()),
             partial(service.send_response, header=header))
-        if self.entity.source >= 0:
+        if self.source >= 0:
             engine.arrived(work, None, now, -1, now)
         else:
             engine.ready(work, now)
+
+
+class ClientEntity(ArrivalEntity):
+    """A client: its responses complete futures, whose callbacks run in the executor."""
+
+    kind = 'client'
+    list_name = 'clients'
+    names_type = False
+
+    __slots__ = ()
+
+    def describe(self) -> None:
+        """Set its label."""
+        self.label = compat.service_name(self.rclpy)
+
+    def listen(self, rooms: Rooms) -> None:
+        """Let the spinning thread collect responses."""
+        self._take = compat.response_taker(self.rclpy)
+        self.listen_in(rooms, rooms.at_once.loop)
+
+    def post(self, taken: Any) -> None:
+        """Complete the future of a response."""
+        header, response = taken
+        pool = self.rooms.pool
+        compat.complete_request(
+            self.rclpy, header.request_id.sequence_number, response,
+            pool.outer_groups.get(self.outer) or pool.executor)
+        self.rooms.at_once.has_run = True

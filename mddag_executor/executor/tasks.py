@@ -31,7 +31,7 @@ from mddag_executor.executor.compat import (
     function_of_task,
     QuickCallback,
 )
-from mddag_executor.executor.entity import Entity, TASK
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.work import current, TaskWork, Work
 from rclpy.task import Future
 
@@ -174,6 +174,18 @@ def watched(future: Future, notify: Callable[[], object]) -> Iterator[None]:
         raise error
 
 
+class TaskEntity(Entity):
+    """A task: it belongs to no node, and nothing arrives at it."""
+
+    kind = 'task'
+    names_type = False
+
+    __slots__ = ()
+
+    def __init__(self) -> None:
+        super().__init__(None, '')
+
+
 class TaskEntities:
     """
     The executor's records of tasks: one for each function, as each has its own GIL habit.
@@ -184,10 +196,10 @@ class TaskEntities:
     """
 
     def __init__(self) -> None:
-        self.others = Entity(TASK, None, '', None, -1, 0, '')
-        self._entities: dict[object, Entity] = {}
+        self.others = TaskEntity()
+        self._entities: dict[object, TaskEntity] = {}
 
-    def of(self, callback: Any, args: tuple[Any, ...], outer: int = -1) -> Entity:
+    def of(self, callback: Any, args: tuple[Any, ...], outer: int = -1) -> TaskEntity:
         """
         Return the record of a task's function; an action's goals have that of its callback.
 
@@ -200,7 +212,7 @@ class TaskEntities:
             key = outer, None
         found = self._entities.get(key)
         if found is None:
-            found = Entity(TASK, None, '', None, -1, 0, '')
+            found = TaskEntity()
             found.outer = outer
             found.address = self.others.address
             self._entities[key] = found

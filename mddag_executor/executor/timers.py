@@ -27,11 +27,18 @@ from typing import Any
 
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.executor.agenda import Agenda
-from mddag_executor.executor.compat import RCL_ERRORS, timer_functions, with_timer_info
+from mddag_executor.executor.compat import (
+    ends_sleep,
+    RCL_ERRORS,
+    timer_functions,
+    with_timer_info,
+)
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.kinds import ListenerEntity, Rooms
 from mddag_executor.executor.listeners import NextCall
-from mddag_executor.executor.sources import EntitySource
 from mddag_executor.executor.work import Work
+from msg_graph.binding import Entity as Declarable
+from msg_graph.duration import exact_duration
 from rclpy.clock import Clock, JumpHandle, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -53,45 +60,78 @@ Fired = tuple[Work, int, int, int]
 _now = time.monotonic_ns
 
 
-class TimerSource(EntitySource):
+class TimerEntity(ListenerEntity):
     """
     A timer.
 
-    Its listener announces that it is reset.
+    Its listener announces that it is reset.  The timer of a ``Rate`` is handled at once.
 
     :ivar due: when to ask rcl next (monotonic ns), while its entry in the agenda is not empty.
     """
 
-    def __init__(self, entity: Entity, queue: TimerQueue) -> None:
-        super().__init__(entity)
-        timer = self.timer = entity.rclpy
-        self._queue = queue
+    kind = 'timer'
+    list_name = 'timers'
+    is_due_at_release = True
+    keeps_oldest = True
+    is_known_to_caret = True
+
+    __slots__ = (
+        'until', 'period', 'last_period', 'due', 'entry', 'simulated', 'may_be_simulated',
+        '_next_call', '_call', '_clock', '_is_steady', '_offset', '_queue')
+
+    def describe(self) -> None:
+        """Set label, depth and whatever else does not change."""
+        period = self.rclpy.timer_period_ns
+        self.depth, self.label = 1, exact_duration(period)
+        self.may_be_gone = True
+        self.declarable = Declarable(self.node, self.kind, '', period)
+
+    def is_cancelled(self) -> bool:
+        """Return whether it was cancelled: it may have become due once more before that."""
+        return bool(self.rclpy.is_canceled())
+
+    def record(self, say: Callable[..., None], node: int) -> None:
+        """Record it with CARET's tracepoints."""
+        handle = id(self.rclpy)
+        say('rcl_timer_init', handle, self.rclpy.timer_period_ns)
+        say('rclcpp_timer_callback_added', handle, self.address)
+        say('rclcpp_timer_link_node', handle, node)
+        say('rclcpp_callback_register', self.address, self.symbol)
+
+    def listen(self, rooms: Rooms) -> None:
+        """Let rcl announce resets, and begin to ask when it is due."""
+        timer = self.rclpy
+        # ``create_rate`` sets the callback only after it has notified the executor
+        is_of_rate = self.callback is None and (
+            timer.callback is None or ends_sleep(timer.callback))
+        place = rooms.at_once if is_of_rate else rooms.pool
+        self._queue = place.timers
         with self.handle:
             self._next_call = NextCall(self.handle.pointer)
         self.until, self._call, self.period = timer_functions(timer)
         self._clock: Any = timer.clock
         self._is_steady = timer.clock.clock_type == ClockType.STEADY_TIME
         self.may_be_simulated = timer.clock.clock_type == ClockType.ROS_TIME
-        self._offset = 0
+        self._offset = self.due = 0
         self.last_period = timer.timer_period_ns
-        self.due = 0
         self.entry: list[Any] | None = None
         self.simulated = False
-
-    def listen(self) -> None:
-        """Let rcl announce resets, and begin to ask when it is due."""
-        super().listen()
-        self._queue.add(self)
+        self.listen_in(rooms, place.loop, f'timers {self.node}')
+        with rooms.pool.lock:
+            self._queue.add(self)
 
     def ignore(self) -> None:
         """End ``listen``."""
-        self._queue.remove(self)
+        if self.fd >= 0:
+            with self.rooms.pool.lock:
+                self._queue.remove(self)
         super().ignore()
 
     def collect(self) -> None:
         """Ask rcl when it is due, as it was reset."""
-        if self.fd >= 0:  # else it was removed after its arrival was found
-            self._queue.ask(self)
+        with self.rooms.pool.lock:
+            if self.fd >= 0:  # else it was removed after its arrival was found
+                self._queue.ask(self)
 
     def come_due(self) -> None:
         """Fire, if rcl agrees."""
@@ -120,10 +160,10 @@ class TimerSource(EntitySource):
     def call(self) -> Work | None:
         """Let rcl advance it; return its execution, None if it has no callback."""
         info = self._call()
-        callback = self.timer.callback
+        callback = self.rclpy.callback
         if callback is None:
             return None
-        return Work(self.entity, with_timer_info(self.timer, callback, info))
+        return Work(self, with_timer_info(self.rclpy, callback, info))
 
 
 class TimerQueue:
@@ -146,7 +186,7 @@ class TimerQueue:
         self._report = report
         self._on_change = on_change
         self._on_error = on_error
-        self._timers: dict[int, TimerSource] = {}
+        self._timers: dict[int, TimerEntity] = {}
         #: returns how long a timer with a period may stay unnoticed while a callback computes
         self.allowance: Callable[[Entity, int], int] = lambda *_: 0
         self._jumps: dict[int, tuple[Clock, JumpHandle]] = {}
@@ -154,20 +194,20 @@ class TimerQueue:
 
     # --- timers --- ------------------------------------------------------------------------------
 
-    def add(self, source: TimerSource) -> None:
+    def add(self, source: TimerEntity) -> None:
         """Add a timer."""
         self._timers[id(source)] = source
         if source.may_be_simulated:
-            self._watch(source.timer.clock)
+            self._watch(source.rclpy.clock)
         self.ask(source)
 
-    def remove(self, source: TimerSource) -> None:
+    def remove(self, source: TimerEntity) -> None:
         """Remove a timer."""
         self._timers.pop(id(source), None)
         self._agenda.cancel(source)
-        clock = source.timer.clock
+        clock = source.rclpy.clock
         if source.may_be_simulated and all(
-                each.timer.clock is not clock for each in self._timers.values()):
+                each.rclpy.clock is not clock for each in self._timers.values()):
             self._watch_no_more(clock)
 
     def _watch(self, clock: Clock) -> None:
@@ -202,7 +242,7 @@ class TimerQueue:
 
     # --- due times -------------------------------------------------------------------------------
 
-    def ask(self, source: TimerSource) -> None:
+    def ask(self, source: TimerEntity) -> None:
         """Ask rcl when a timer is due that is new or was reset."""
         try:
             with source.handle:
@@ -210,7 +250,7 @@ class TimerQueue:
         except RCL_ERRORS as error:
             self._failed(source, error)
 
-    def _ask(self, source: TimerSource) -> None:
+    def _ask(self, source: TimerEntity) -> None:
         source.simulated = source.is_simulated()
         if source.simulated:
             self._agenda.cancel(source)
@@ -223,9 +263,9 @@ class TimerQueue:
         elif not source.entry or due != source.due:
             self._push(source, due)
 
-    def _push(self, source: TimerSource, due: int) -> None:
+    def _push(self, source: TimerEntity, due: int) -> None:
         source.due = due
-        self._agenda.set(source, due, due + self.allowance(source.entity, source.last_period))
+        self._agenda.set(source, due, due + self.allowance(source, source.last_period))
 
     def ask_after_jump(self) -> None:
         """Ask rcl about all timers whose clocks may have jumped."""
@@ -234,7 +274,7 @@ class TimerQueue:
             if source.may_be_simulated:
                 self.ask(source)
 
-    def fire(self, source: TimerSource) -> None:
+    def fire(self, source: TimerEntity) -> None:
         """Report a timer that is due, if rcl agrees, and set its next due time."""
         try:
             with source.handle:
@@ -245,10 +285,10 @@ class TimerQueue:
         if fired is not None:
             self._report(fired)
 
-    def _fire(self, source: TimerSource) -> Fired | None:
+    def _fire(self, source: TimerEntity) -> Fired | None:
         """Call a timer if rcl reports it due, and push its next due time."""
-        if source.entity.waiting and source.period() <= 0:
-            source.entity.collect_more = partial(self._fire_again, source)
+        if source.waiting and source.period() <= 0:
+            source.collect_more = partial(self._fire_again, source)
             return None
         if source.simulated:  # since the last jump of its clock, which is handled first
             return self._fire_simulated(source)
@@ -278,7 +318,7 @@ class TimerQueue:
         missed = max(0, (after - due + period // 2) // period - 1)
         return None if work is None else (work, due, missed, period)
 
-    def _fire_simulated(self, source: TimerSource) -> Fired | None:
+    def _fire_simulated(self, source: TimerEntity) -> Fired | None:
         if not source.is_due():
             return None
         work = source.call()
@@ -286,12 +326,12 @@ class TimerQueue:
             self._push(source, _now() + ZERO_PERIOD_NS)
         return None if work is None else (work, _now(), 0, 0)
 
-    def _fire_again(self, source: TimerSource) -> None:
+    def _fire_again(self, source: TimerEntity) -> None:
         """Continue with a timer without a period, as its execution has started."""
         if id(source) in self._timers and not source.entry:
             self._push(source, _now() + ZERO_PERIOD_NS)
 
-    def _failed(self, source: TimerSource, error: Exception) -> None:
+    def _failed(self, source: TimerEntity, error: Exception) -> None:
         """Classify an exception of rcl: the timer is destroyed or cancelled, or it is an error."""
         self._agenda.cancel(source)
         try:

@@ -6,14 +6,21 @@ Waitables (actions, QoS events, and user-defined ones), and guard conditions.
 Theory of operation
 -------------------
 1.  A waitable consists of rcl entities, which a wait set contains after the waitable has been
-    added to it.  Each entity gets the listener of its kind, so a waitable is a source like others
-    (``WaitableSource``).  After an arrival the waitable is asked with its own wait set, which does
-    not wait.  The QoS events of all nodes share one such source, as they are rare.  Setting the
-    listener of an event marks earlier events as known, so a wait set does not report them any
-    more.  Therefore all events are taken, and those with unchanged counts are dropped.
-2.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next.
-3.  rcl has no listener for guard conditions.  One thread waits in a wait set (``WaitSetThread``)
-    for these, for user-defined waitables that contain any, and for rclpy's signal condition.
+    added to it.  Each of these gets the listener of its kind (``listeners``), also a guard
+    condition, whose trigger is wrapped for this (``publishing``).  So nothing waits in a wait set.
+    After an arrival the waitables are asked with their own wait set, which does not wait
+    (``WaitableSource``).
+2.  Each waitable and each guard condition has a source of its own.  Only QoS events share one, as
+    they are rare.
+3.  Setting the listener of a QoS event marks earlier events as known, so a wait set does not
+    report them any more.  Therefore all events are taken, and those with unchanged counts are
+    dropped.
+4.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next.
+5.  *The exception* is a thread that waits in a wait set (``WaitSetThread``).  It waits for rclpy's
+    signal condition: rclpy's handler of SIGTERM is C++, triggers the condition without Python, and
+    writes to no descriptor.  It also waits for a waitable that contains no entity, or one for
+    which the middleware has no listener.  A waitable without any entity is ready when it says so:
+    it is asked whenever the executor is woken (``Executor.wake``).
 """
 
 from __future__ import annotations
@@ -28,12 +35,13 @@ import weakref
 from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import END_S, MOST
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.hall import Hall
+from mddag_executor.executor.kinds import Kind, Rooms
 from mddag_executor.executor.listeners import clear_listener, ListenerError, NextCall, set_listener
 from mddag_executor.executor.loop import ChannelSource
 from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, stop_at_exit
 from mddag_executor.executor.waitsets import FilledSet
 from mddag_executor.executor.work import Work
-from mddag_executor.executor.workers import WorkerPool
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
@@ -45,7 +53,91 @@ SENDER_CHECKS = 500
 Result = TypeVar('Result')
 
 
-def executions_of(entity: Entity, pool: WorkerPool) -> list[Work]:
+class AskedEntity(Kind):
+    """An entity with a wait set of its own."""
+
+    __slots__ = ('_rooms', '_source')
+
+    def __init__(self, rclpy: Any, node: str) -> None:
+        super().__init__(rclpy, node)
+        self._rooms: Rooms | None = None
+        self._source: WaitableSource | None = None
+
+    def listen(self, rooms: Rooms) -> None:
+        """Let it be asked when one of its parts has announced an arrival."""
+        self._rooms = rooms
+        try:
+            self._source = open_source(WaitableSource, [self], rooms.pool)
+        except ListenerError:
+            rooms.unlistened.add(self)
+
+    def ignore(self) -> None:
+        """End ``listen``."""
+        rooms, self._rooms = self._rooms, None
+        source, self._source = self._source, None
+        if source is not None:
+            source.close()
+        elif rooms is not None:
+            rooms.unlistened.remove(self)
+
+
+class WaitableEntity(AskedEntity):
+    """A waitable of an action, or a user-defined one."""
+
+    kind = 'waitable'
+    list_name = 'waitables'
+
+    __slots__ = ()
+
+
+class GuardEntity(AskedEntity):
+    """A guard condition of a node."""
+
+    kind = 'guard'
+    list_name = 'guards'
+
+    __slots__ = ()
+
+    def describe(self) -> None:
+        """Set its label."""
+        self.label = 'condition'
+
+
+class EventEntity(Kind):
+    """A QoS event: rclpy's ``EventHandler``, if it waits and takes as rclpy's does."""
+
+    kind = 'waitable'
+    list_name = 'waitables'
+
+    __slots__ = ('_rooms',)
+
+    def __init__(self, rclpy: Any, node: str) -> None:
+        super().__init__(rclpy, node)
+        self._rooms: Rooms | None = None
+
+    @classmethod
+    def fits(cls, rclpy_object: Any) -> bool:
+        """Return whether a waitable is of this kind."""
+        kind = type(rclpy_object)
+        return isinstance(rclpy_object, EventHandler) and all(
+            getattr(kind, name) is getattr(EventHandler, name)
+            for name in ('add_to_wait_set', 'is_ready', 'take_data', 'get_num_entities'))
+
+    def listen(self, rooms: Rooms) -> None:
+        """Let it be asked with the other events."""
+        self._rooms = rooms
+        rooms.events.add(self)
+
+    def ignore(self) -> None:
+        """End ``listen``."""
+        rooms, self._rooms = self._rooms, None
+        if rooms is not None:
+            rooms.events.remove(self)
+
+
+# --- sources -------------------------------------------------------------------------------------
+
+def executions_of(entity: Entity, pool: Hall) -> list[Work]:
     """
     Take the ready data of a waitable; return the executions that handle them.
 
@@ -62,24 +154,66 @@ def executions_of(entity: Entity, pool: WorkerPool) -> list[Work]:
     return found
 
 
-class WaitableSource(ChannelSource):
+class Asked:
     """
-    Waitables that share a descriptor.
+    Waitables and guard conditions that are asked with one wait set.
 
-    :param entities: those of the waitables.
-    :raises ListenerError: when they contain an entity that has no listener.
+    :param more_guards: conditions that are in the set as well, and are no entities.
     :raises InvalidHandle: when one of them has been destroyed.
     """
 
-    def __init__(self, entities: Iterable[Entity], pool: WorkerPool) -> None:
-        self._by_id = {id(entity.rclpy): entity for entity in entities}
+    def __init__(
+        self, entities: Iterable[Entity], pool: Hall, more_guards: Iterable[GuardCondition] = (),
+    ) -> None:
         self._pool = pool
-        self._set = FilledSet(pool.context, [entity.rclpy for entity in entities])
+        self.by_id = {id(entity.rclpy): entity for entity in entities}
+        objects = [entity.rclpy for entity in self.by_id.values()]
+        self.set = FilledSet(
+            pool.context, [each for each in objects if isinstance(each, Waitable)],
+            [*more_guards, *(each for each in objects if not isinstance(each, Waitable))])
+
+    def ask(self, timeout_ns: int | None) -> tuple[list[Work], list[GuardCondition]]:
+        """
+        Return the executions that are ready, and the triggered conditions that are no entities.
+
+        :param timeout_ns: see ``FilledSet.wait``.
+        """
+        found: list[Work] = []
+        others = []
+
+        def take(waitable: Waitable) -> None:
+            found.extend(executions_of(self.by_id[id(waitable)], self._pool))
+
+        for guard in self.set.wait(timeout_ns, take):
+            entity = self.by_id.get(id(guard))
+            if entity is None:
+                others.append(guard)
+            elif guard.callback is not None:
+                found.append(Work(entity, guard.callback))
+        return found, others
+
+
+class WaitableSource(ChannelSource):
+    """
+    Waitables and guard conditions that share a descriptor.
+
+    :param entities: those of the waitables and guard conditions.
+    :raises ListenerError: when they contain an entity that has no listener, or none at all.
+    :raises InvalidHandle: when one of them has been destroyed.
+    """
+
+    def __init__(self, entities: Iterable[Entity], pool: Hall) -> None:
+        super().__init__()
+        self._entities = list(entities)
+        self._pool = pool
+        self._asked = Asked(self._entities, pool)
+        self._set = self._asked.set
         self._timers: list[NextCall] = []
+        self._guards: list[int] = []
         self._has_parts = False
-        self._set.parts(self._set.waitables, self._add_part)
+        self._set.parts(self._add_part)
         if not self._has_parts:
-            raise ListenerError('nothing has no listener')  # it is ready when another one is
+            raise ListenerError('a waitable that contains no entity has no listener')
         self._lock = threading.Lock()
         self._has_more = False
         self._ignored = False
@@ -87,26 +221,31 @@ class WaitableSource(ChannelSource):
     def _add_part(self, kind: str, address: int) -> None:
         self._has_parts = True
         if kind == 'guard_condition':
-            raise ListenerError('a guard condition has no listener')
+            self._guards.append(address)
         if kind == 'timer':
             self._timers.append(NextCall(address))
 
     def listen(self) -> None:
         """Let the middleware announce arrivals, or raise ListenerError or InvalidHandle."""
         with self._lock:  # announcements meanwhile must not also fill the wait set
-            self._set.parts(self._set.waitables,
-                            lambda kind, address: set_listener(kind, address, self.fd))
+            self._set.parts(lambda kind, address: set_listener(kind, address, self.fd))
         if self._has_more:
             self._ask()
 
-    def ignore(self) -> None:
+    def close(self) -> None:
         """End ``listen``, and wait until no thread collects from it."""
         self._ignored = True
         with self._lock:
-            call_with_living(list(self._by_id.values()), self._clear)
+            for address in self._guards:  # of destroyed ones as well
+                clear_listener('guard_condition', address, self.fd)
+            call_with_living(
+                [each for each in self._entities if isinstance(each.rclpy, Waitable)], self._clear)
+        with self._pool.lock:
+            self._pool.loop.remove(self)
 
     def _clear(self, living: list[Entity]) -> None:
-        self._set.parts([each.rclpy for each in living], clear_listener)
+        self._set.parts(lambda kind, address: clear_listener(kind, address, self.fd),
+                        [each.rclpy for each in living])
 
     def collect(self) -> None:
         """Collect the arrivals soon: without the engine's lock, as this calls foreign code."""
@@ -127,15 +266,11 @@ class WaitableSource(ChannelSource):
 
     def _collect(self) -> None:
         found: list[Work] = []
-
-        def take(waitable: Waitable) -> None:
-            found.extend(executions_of(self._by_id[id(waitable)], self._pool))
-
         for _ in range(MOST):
-            before = len(found)
-            self._set.wait(0, take)
-            if len(found) == before:
+            more, _ = self._asked.ask(0)
+            if not more:
                 break
+            found += more
         else:  # there may be more, after the other sources
             self._pool.call_at(time.monotonic_ns(), self._ask)
         if found:
@@ -149,7 +284,8 @@ class WaitableSource(ChannelSource):
     def _post_noted(self, found: list[Work], checks: int = 0) -> None:
         """Post executions; a response only after the sending thread has noted the request."""
         early = [] if checks >= SENDER_CHECKS else [
-            work for work in found if compat.sender_is_behind(work.entity.rclpy, work.args[0])]
+            work for work in found
+            if work.args and compat.sender_is_behind(work.entity.rclpy, work.args[0])]
         if len(early) < len(found):
             self._pool.post([work for work in found if work not in early])
         if early:
@@ -175,12 +311,26 @@ def call_with_living(
     return None
 
 
-def is_qos_event(waitable: Waitable) -> bool:
-    """Return whether a waitable is an ``EventHandler`` that waits and takes as rclpy's does."""
-    kind = type(waitable)
-    return isinstance(waitable, EventHandler) and all(
-        getattr(kind, name) is getattr(EventHandler, name)
-        for name in ('add_to_wait_set', 'is_ready', 'take_data', 'get_num_entities'))
+def open_source(
+    make: Callable[[list[Entity], Hall], WaitableSource], entities: list[Entity], pool: Hall
+) -> WaitableSource | None:
+    """
+    Return a source of the entities that listens; None: they are all destroyed.
+
+    :raises ListenerError: when there is no listener for one of them.
+    """
+    def listen(alive: list[Entity]) -> WaitableSource:
+        source = make(alive, pool)
+        with pool.lock:
+            pool.loop.add(source)
+        try:
+            source.listen()
+        except (InvalidHandle, ListenerError):
+            source.close()
+            raise
+        return source
+
+    return call_with_living(entities, listen)
 
 
 _known: weakref.WeakKeyDictionary[Entity, list[int]] = weakref.WeakKeyDictionary()
@@ -194,15 +344,17 @@ class EventsSource(WaitableSource):
     :param note: called with each event and its status.
     """
 
-    def __init__(self, note: Callable[[Any, Any], None], *others: Any) -> None:
-        super().__init__(*others)
+    def __init__(
+        self, note: Callable[[Any, Any], None], entities: Iterable[Entity], pool: Hall
+    ) -> None:
+        super().__init__(entities, pool)
         self._note = note
 
     def _collect(self) -> None:
         found: list[Work] = []
 
         def take(event: Waitable) -> None:
-            entity = self._by_id[id(event)]
+            entity = self._asked.by_id[id(event)]
             status = event.take_data()
             values = {name: getattr(status, name) for name in dir(status) if '_count' in name}
             counts = [value for name, value in values.items() if not name.endswith('_change')]
@@ -218,21 +370,71 @@ class EventsSource(WaitableSource):
             self._pool.post(found)
 
 
+class SharedSource:
+    """
+    Entities that share one source, which is made again when there are others.
+
+    :param make: makes the source.
+    :param unlistened: where those listen for which the middleware has no listener.
+    """
+
+    def __init__(
+        self, make: Callable[[list[Entity], Hall], WaitableSource], pool: Hall,
+        unlistened: WaitSetThread,
+    ) -> None:
+        self._make = make
+        self._pool = pool
+        self._unlistened = unlistened
+        self._entities: list[Entity] = []
+        self._source: WaitableSource | None = None
+        self._has_changed = False
+
+    def add(self, entity: Entity) -> None:
+        """Add an entity; the source contains it after the next ``apply``."""
+        self._entities.append(entity)
+        self._has_changed = True
+
+    def remove(self, entity: Entity) -> None:
+        """Remove an entity."""
+        self._entities.remove(entity)
+        self._unlistened.remove(entity)
+        self._has_changed = True
+
+    def apply(self) -> None:
+        """Listen to the entities that there are now, and to no other one any more."""
+        if not self._has_changed:
+            return
+        self._has_changed = False
+        source, self._source = self._source, None
+        if source is not None:
+            source.close()
+        for entity in self._entities:
+            self._unlistened.remove(entity)
+        try:
+            self._source = open_source(self._make, list(self._entities), self._pool)
+        except ListenerError:
+            for entity in self._entities:
+                self._unlistened.add(entity)
+
+
 class WaitSetThread:
     """
-    A thread that waits for entities without a listener.
+    A thread that waits for a signal, and for entities without a listener.
 
     :param signals: rclpy's signal condition, or None.
     :param on_signal: called when it is triggered.
     """
 
-    def __init__(self, pool: WorkerPool, signals: Any, on_signal: Callable[[], None]) -> None:
+    def __init__(self, pool: Hall, signals: Any, on_signal: Callable[[], None]) -> None:
         self._pool = pool
         self._context = pool.context
         self._signals = signals
         self._on_signal = on_signal
         self._guard = GuardCondition(None, None, self._context)
+        # those to wait for from the next ``apply`` on, and now
+        self._next_entities: list[Entity] = []
         self._entities: list[Entity] = []
+        self._has_begun = False
         self._changed = False
         self._ending = False
         self._applied = threading.Event()
@@ -241,16 +443,27 @@ class WaitSetThread:
         self._thread: threading.Thread | None = None
         call_at_shutdown(self._context, self.wake)
 
-    def update(self, entities: list[Entity]) -> None:
-        """
-        Set the guard conditions and waitables to wait for.
+    def add(self, entity: Entity) -> None:
+        """Wait for an entity as well, from the next ``apply`` on."""
+        self._next_entities.append(entity)
 
-        Returns when no data of the earlier ones are being taken any more.
+    def remove(self, entity: Entity) -> None:
+        """End ``add``; does nothing for other entities."""
+        if entity in self._next_entities:
+            self._next_entities.remove(entity)
+
+    def apply(self) -> None:
         """
-        if entities == self._entities:
+        Wait for the entities that there are now.
+
+        Returns when no data of removed ones are being taken any more.
+        """
+        if self._next_entities == self._entities:
             return
-        self._entities = entities
+        self._entities = list(self._next_entities)
         self._changed = True
+        if self._has_begun:
+            self.start()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._applied.clear()
             self.wake()
@@ -270,6 +483,11 @@ class WaitSetThread:
                 self._has_answered.wait(0.1)
                 self._has_answered.clear()
 
+    def ask_again(self) -> None:
+        """Ask the waitables again, as the executor was woken: they may be ready."""
+        if self._entities:
+            self.wake()
+
     def wake(self) -> None:
         """End the current wait."""
         try:
@@ -278,7 +496,10 @@ class WaitSetThread:
             pass
 
     def start(self) -> None:
-        """Begin to wait; further calls do nothing."""
+        """Begin to wait if there is anything to wait for; further calls do nothing."""
+        self._has_begun = True
+        if self._signals is None and not self._entities:
+            return
         if self._thread is None or not self._thread.is_alive() and not self._ending:
             stop_at_exit(self)
             self._changed = True
@@ -294,18 +515,17 @@ class WaitSetThread:
             join(self._thread, END_S)
 
     def _run(self) -> None:
-        waiting: FilledSet | None = None
-        by_id: dict[int, Entity] = {}
+        waiting: Asked | None = None
         while not self._ending and not is_over(self._context):
             try:
-                if self._changed or waiting is None:
+                is_new = self._changed or waiting is None
+                if is_new or waiting is None:
                     self._changed = False
                     waiting = None  # releases the earlier ones
-                    by_id = {id(each.rclpy): each for each in self._entities}
                     waiting = self._build(self._entities)
                     self._applied.set()
                 asked = self._asked
-                self._wait(waiting, by_id, -1 if asked == self._answered else 0)
+                self._wait(waiting, 0 if is_new or asked != self._answered else -1)
                 self._answered = asked
                 self._has_answered.set()
             except Exception as error:
@@ -318,24 +538,13 @@ class WaitSetThread:
         self._applied.set()
         self._on_signal()
 
-    def _build(self, entities: list[Entity]) -> FilledSet:
+    def _build(self, entities: list[Entity]) -> Asked:
         own = [self._guard] + ([self._signals] if self._signals is not None else [])
-        alive = [each.rclpy for each in entities if compat.alive(each.rclpy)]
-        return FilledSet(
-            self._context, [each for each in alive if isinstance(each, Waitable)],
-            [*own, *(each for each in alive if not isinstance(each, Waitable))])
+        return Asked([each for each in entities if compat.alive(each.rclpy)], self._pool, own)
 
-    def _wait(self, waiting: FilledSet, by_id: dict[int, Entity], timeout_ns: int) -> None:
-        found: list[Work] = []
-
-        def take(waitable: Waitable) -> None:
-            found.extend(executions_of(by_id[id(waitable)], self._pool))
-
-        for guard in waiting.wait(timeout_ns, take):
-            entity = by_id.get(id(guard))
-            if guard is self._signals:
-                self._on_signal()
-            elif entity is not None and guard.callback is not None:
-                found.append(Work(entity, guard.callback))
+    def _wait(self, waiting: Asked, timeout_ns: int) -> None:
+        found, triggered = waiting.ask(timeout_ns)
+        if self._signals in triggered:
+            self._on_signal()
         if found:
             self._pool.post(found)

@@ -66,27 +66,32 @@ class FilledSet:
         """Protect all of them from being destroyed while entered, or raise InvalidHandle."""
         return _held(self._held)
 
-    def parts(self, waitables: Iterable[Waitable], call: Callable[[str, int], None]) -> None:
+    def parts(
+        self, call: Callable[[str, int], None], waitables: Iterable[Waitable] | None = None
+    ) -> None:
         """
-        Call a function with kind and address of each rcl entity in some of the waitables.
+        Call a function with kind and address of each rcl entity.
 
         Kinds are ``subscription``, ``guard_condition``, ``timer``, ``client``, ``service``,
         ``event``.
 
+        :param waitables: only those in these waitables; None: all, with the guard conditions.
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        with _held([self._context, *waitables]):
-            self._fill(waitables)
+        chosen = self._held if waitables is None else [self._context, *waitables]
+        with _held(chosen):
+            self._fill(self.waitables if waitables is None else waitables,
+                       self._guards.values() if waitables is None else ())
             filled = _RclWaitSet.from_address(self._set.pointer)
             for kind in _KINDS:
                 for index in range(getattr(filled, f'n_{kind}')):
                     address = getattr(filled, kind)[index]
-                    if address is not None and address not in self._guards:
+                    if address is not None:
                         call(kind, address)
 
-    def _fill(self, waitables: Iterable[Waitable]) -> None:
+    def _fill(self, waitables: Iterable[Waitable], guards: Iterable[GuardCondition]) -> None:
         self._set.clear_entities()
-        for guard in self._guards.values():
+        for guard in guards:
             self._set.add_guard_condition(guard.handle)
         for waitable in waitables:
             waitable.add_to_wait_set(self._set)
@@ -107,7 +112,7 @@ class FilledSet:
         :raises InvalidHandle: when one of them has been destroyed.
         """
         with _held(self._held):
-            self._fill(self.waitables)
+            self._fill(self.waitables, self._guards.values())
             if timeout_ns is not None:
                 self._set.wait(timeout_ns)
             for waitable in self.waitables:

@@ -27,7 +27,7 @@ import types
 from typing import Any, Protocol
 
 from mddag_executor.executor.compat import cancel_running
-from mddag_executor.executor.entity import Entity, TIMER
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import Origin
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
@@ -161,7 +161,7 @@ class Work:
         try:
             with entity.handle:
                 # It may have become due once more before its callback cancelled it.
-                if entity.kind == TIMER and entity.rclpy.is_canceled():
+                if entity.is_cancelled():
                     raise Destroyed
         except InvalidHandle:
             raise Destroyed from None

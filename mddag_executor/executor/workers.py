@@ -67,7 +67,7 @@ from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN, QuickCallba
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import Entity, SERVICE, SUBSCRIPTION
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.hall import Announced, Spinner
 from mddag_executor.executor.jobs import header_stamp, PublisherState
@@ -424,8 +424,7 @@ class WorkerPool:
 
     def note_eager(self, entity: Entity) -> None:
         """Note whether a thread must wait for an entity's messages or requests, at any time."""
-        is_eager = entity.kind in (SUBSCRIPTION, SERVICE) and (
-            entity.may_come_from_outside() and entity.is_eager())
+        is_eager = entity.may_come_from_outside() and entity.is_eager()
         if is_eager != entity.counts_as_eager:
             with self.lock:
                 if is_eager != entity.counts_as_eager and not entity.removed:

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mddag_executor.executor.compat import alive, BareExecutor, QuickCallback
-from mddag_executor.executor.entity import Entity, TASK
-from mddag_executor.executor.tasks import make_task, Unclaimed
+from mddag_executor.executor.tasks import make_task, TaskEntity, Unclaimed
 from mddag_executor.executor.work import Work
 from mddag_executor.hosting.host import Guest, Host
 from mddag_executor.rerun.loop import Loop, POLL_NS
@@ -22,7 +21,7 @@ class NodeHolder(BareExecutor):
 
     def __init__(self, context: Any, loop: Loop) -> None:
         super().__init__(context=context)
-        self.task_entity = Entity(TASK, None, '', None, -1, 0, '')
+        self.task_entity = TaskEntity()
         self._loop = loop
         self._unclaimed = Unclaimed(lambda error: None)  # none is deferred
 

@@ -35,9 +35,10 @@ from typing import Any
 
 from mddag_executor.clocks import TraceClock
 from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
-from mddag_executor.executor.entity import Entity, SUBSCRIPTION
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.jobs import header_stamp, Origin
 from mddag_executor.executor.publishing import state_of
+from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.durations import Durations
@@ -145,7 +146,7 @@ class Messages:
             outlet.subscriptions = None
             self.offered.setdefault(outlet.state.topic, []).append(outlet)
         for entity in added:
-            if entity.kind == SUBSCRIPTION and _is_latched(entity.rclpy.qos_profile):
+            if isinstance(entity, SubscriptionEntity) and _is_latched(entity.rclpy.qos_profile):
                 self._deliver_kept(entity)
         if not self._gives_clock and CLOCK in self._subscriptions and (
                 CLOCK not in self._recording.topics and CLOCK not in self.offered):

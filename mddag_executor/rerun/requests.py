@@ -36,8 +36,8 @@ from mddag_executor.executor.compat import (
     SERVER_HANDLE,
     service_name,
 )
-from mddag_executor.executor.entity import Entity, SERVICE
 from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.sources import ServiceEntity
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.loop import Loop, TIMER
@@ -94,9 +94,9 @@ class Requests:
 
     # --- services --------------------------------------------------------------------------------
 
-    def _service(self, name: str) -> Entity | None:
-        return next((entity for entity in self._registry.by_id.values()
-                     if entity.kind == SERVICE and entity.label == name), None)
+    def _service(self, name: str) -> ServiceEntity | None:
+        return next((entity for entity in self._registry.of_kind(ServiceEntity)
+                     if entity.label == name), None)
 
     def _wait_for_service(self, client: Client, timeout_sec: float | None = None) -> bool:
         name = service_name(client)

@@ -25,13 +25,14 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
 from mddag_executor.executor import publishing
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import WAITABLE
 from mddag_executor.executor.name_check import unbound_text
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.shutdown import is_over
-from mddag_executor.executor.waitables import is_qos_event
+from mddag_executor.executor.sources import SubscriptionEntity
+from mddag_executor.executor.timers import TimerEntity
+from mddag_executor.executor.waitables import WaitableEntity
 from mddag_executor.executor.work import Work
 from mddag_executor.hosting.initialised import initialised
 from mddag_executor.hosting.loading import describe, Program, ros_arguments
@@ -201,7 +202,8 @@ class Rerun:
         hosted = registry.hosted()
         self._hosted |= hosted
         if added or gone:
-            self._other_processes.host(hosted, registry.subscriptions(), engine.record, now)
+            self._other_processes.host(
+                hosted, registry.of_kind(SubscriptionEntity), engine.record, now)
         for entity in added:
             entity.since = now
             if entity.rclpy in self._triggered:
@@ -209,16 +211,15 @@ class Rerun:
                 engine.ready(Work(entity, entity.rclpy.callback), now)
             if entity.callback is not None and entity.callback.key in self._holders:
                 entity.habit.holds = 1
-            if entity.kind == WAITABLE and not self._requests.knows(entity.rclpy) and (
-                    not is_qos_event(entity.rclpy)):
+            if isinstance(entity, WaitableEntity) and not self._requests.knows(entity.rclpy):
                 self._loop.warn(
                     f'{entity.name}: a waitable of its own kind, which never gets ready')
         for entity in gone:
             engine.remove(entity, now)
-        self._timers.refresh(registry.timers())
+        self._timers.refresh(registry.of_kind(TimerEntity))
         if self._recorder is not None:
             self._recorder.entities(nodes, added)
-        self._messages.refresh(nodes, added, registry.subscriptions())
+        self._messages.refresh(nodes, added, registry.of_kind(SubscriptionEntity))
 
     # --- the run ---------------------------------------------------------------------------------
 

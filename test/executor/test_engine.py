@@ -12,7 +12,7 @@ from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import Entity, TIMER
+from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import GilCheck, GilHabit
 from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Work
@@ -34,16 +34,23 @@ def new_engine(task_set=None, workers=1, policy='rad', **more):
                   **{'default_deadline': 10 ** 9, **more})
 
 
-def new_entity(group=-1, depth=0, holds=False, node='/n', callback=None):
-    entity = Entity('waitable', None, node, callback, group, depth, '')
+class TimerLike(Entity):
+    """An entity whose arrivals are the releases of its jobs, as those of a timer are."""
+
+    is_due_at_release = keeps_oldest = True
+
+
+def new_entity(group=-1, depth=0, holds=False, node='/n', callback=None, kind=Entity):
+    entity = kind(None, node)
+    entity.callback, entity.group, entity.depth = callback, group, depth
     entity.habit = GilHabit(holds)
     return entity
 
 
-def entity_of(engine, task_set, dag, index):
+def entity_of(engine, task_set, dag, index, kind=Entity):
     """Return an entity that one vertex is bound to, with one leg for all of its messages."""
     vertex = task_set.dags[dag].vertices[index]
-    entity = new_entity(node=vertex.callback.node, callback=vertex.callback)
+    entity = new_entity(node=vertex.callback.node, callback=vertex.callback, kind=kind)
     first = engine.tables.first_vertex[dag]
     if index == task_set.dags[dag].source:
         entity.source = first + index
@@ -447,8 +454,7 @@ def test_how_long_a_timer_may_stay_unnoticed(make_executor, kind, deadline, part
     """For a part of deadline or period; one whose callback waits not at all."""
     task_set = loads(graph(n=f'name: tick, timer: 10ms, deadline: {deadline}'))
     executor = make_executor(task_set)
-    entity = entity_of(executor._engine, task_set, 0, 0)
-    entity.kind = TIMER
+    entity = entity_of(executor._engine, task_set, 0, 0, TimerLike)
     if kind == 'undeclared':
         entity.callback, entity.source = None, -1
     entity.habit = GilHabit(kind != 'waits')

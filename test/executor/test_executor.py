@@ -9,7 +9,7 @@ import time
 from builtin_interfaces.msg import Time
 from mddag_executor.executor import workers
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
-from mddag_executor.executor.entity import Entity, TASK
+from mddag_executor.executor.tasks import TaskEntity
 from mddag_executor.executor.work import current, Work
 from mddag_executor.executor.workers import WorkerThread
 import pytest
@@ -205,7 +205,7 @@ def test_one_slow_execution_does_not_make_a_callback_long(make_executor, monkeyp
     """Each execution counts the same; short ones are measured seldom."""
     pool, now, takes = make_executor()._pool, [10**12], [10_000]
     monkeypatch.setattr(workers, 'monotonic_ns', lambda: now[0])
-    entity = Entity(TASK, None, '', None, -1, 0, '')
+    entity = TaskEntity()
     thread = WorkerThread(pool, None)
 
     def run():

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import NEVER
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.listeners import TimerFd
+from mddag_executor.executor.timers import TimerEntity
 from msg_graph import loads
 import pytest
 from rclpy.clock import Clock
@@ -210,7 +211,8 @@ def test_a_timer_without_a_period_stops_no_other_timer(make_executor, make_node,
         assert wait_for(lambda: len(always) == 10)
         before = len(ran), len(often)
         assert wait_for(lambda: len(ran) >= before[0] + 5 and len(often) > before[1] + 5)
-        entity = next(each for each in executor._registry.timers() if each.rclpy is timer)
+        entity = next(
+            each for each in executor._registry.of_kind(TimerEntity) if each.rclpy is timer)
         assert wait_for(lambda: (entity.ready, entity.skipped) == (11, 0))
         go_on.set()
         assert wait_for(lambda: len(always) >= 20)
@@ -299,7 +301,7 @@ def test_a_message_from_before_the_spin_is_released_when_it_begins(
     with Spinning(executor):
         assert wait_for(lambda: got and executor._pool.is_current)
         assert len(released.releases) == 1 and released.releases[0] >= begin
-        source = executor._upkeep._sources[executor._registry.by_id[id(released.subscription)]]
+        source = executor._registry.by_id[id(released.subscription)]
         take = source._take
         source._take = lambda: (take(), time.sleep(0.1))[0]
         time.sleep(0.2)  # no release is before the spin
@@ -308,3 +310,18 @@ def test_a_message_from_before_the_spin_is_released_when_it_begins(
     expected = got[1] if stamp == 'source_timestamp' else sent
     assert len(released.releases) == 2
     assert abs(released.releases[1] - executor._trace_clock.of_system(expected)) < MS
+
+
+def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_node):
+    """Not the one that rclpy makes for simulated time."""
+    node = make_node('node', parameter_overrides=[Parameter('use_sim_time', value=True)])
+    got = []
+    node.create_subscription(ClockMessage, '/clock', got.append, 10)
+    publisher = make_node('clock').create_publisher(ClockMessage, '/clock', 10)
+    executor = make_executor(loads(graph(
+        node='name: on_clock, subscription: /clock, period: 1s, deadline: 1s')), nodes=[node])
+    with Spinning(executor):
+        matched(publisher, count=2)
+        publisher.publish(ClockMessage(clock=TimeMessage(sec=7)))
+        assert wait_for(lambda: got and node.get_clock().now().nanoseconds == 7_000 * MS)
+        assert wait_for(lambda: executor.statistics()['callbacks']['/node:on_clock']['ran'] == 1)

@@ -1,21 +1,23 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Actions, QoS events, and timers that have info."""
+"""Actions, QoS events, guard conditions, waitables of a user's own, and timers with info."""
 
 import os
 import threading
 
 from mddag_executor.executor import compat
-from mddag_executor.executor.waitables import EventsSource
+from mddag_executor.executor.listeners import ListenerError
+from mddag_executor.executor.waitables import EventsSource, WaitableSource
 import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
 
-from .conftest import is_idle, Spinning, wait_for
+from .conftest import is_idle, Pulse, Spinning, wait_for
 
 SUCCEEDED, CANCELED = 4, 5
 QOS = QoSProfile(depth=100)
@@ -157,6 +159,98 @@ def test_the_middleware_writes_to_no_file_after_the_executor_has_ended(
         with file:
             sizes.append(os.fstat(file.fileno()).st_size)
     assert sizes == [0] * 200
+
+
+# --- guard conditions and waitables of a user's own ----------------------------------------------
+
+class Seen(Pulse):
+    """It notes which threads ask it."""
+
+    def __init__(self, node):
+        super().__init__(node, ReentrantCallbackGroup())
+        self.ran, self.asked_by = 0, set()
+
+    def is_ready(self, wait_set):
+        self.asked_by.add(threading.current_thread().name)
+        return super().is_ready(wait_set)
+
+    async def execute(self, taken_data):
+        self.ran += 1
+
+
+@pytest.mark.parametrize('listens', [True, False], ids=['listener', 'thread'])
+def test_what_is_triggered_runs(make_executor, make_node, spinning, monkeypatch, listens):
+    """By a listener, or by the thread that waits if there is none; no matter who triggers it."""
+    node, ran = make_node(), []
+    guard = node.create_guard_condition(lambda: ran.append(1))
+    seen = Seen(node)
+    node.add_waitable(seen)
+    guard.trigger()  # nothing listens yet
+    seen.guard.trigger()
+    if not listens:
+        def listen(self):
+            raise ListenerError('the middleware has none')
+        monkeypatch.setattr(WaitableSource, 'listen', listen)
+
+    def both_run(by_handle):
+        before = len(ran), seen.ran
+        for each in guard, seen.guard:
+            (each.handle.trigger_guard_condition if by_handle else each.trigger)()
+        assert wait_for(lambda: len(ran) > before[0] and seen.ran > before[1])
+
+    with spinning(make_executor(nodes=[node])):
+        assert wait_for(lambda: ran and seen.ran)
+        both_run(False)
+        both_run(True)
+        other = node.create_guard_condition(lambda: ran.append(2))
+        other.trigger()
+        assert wait_for(lambda: 2 in ran)
+        node.destroy_guard_condition(other)
+        both_run(False)
+    assert ('mddag-wait-set' in seen.asked_by) is not listens
+
+
+class Bare(Waitable):
+    """A waitable without any entity: it is ready when it says so."""
+
+    def __init__(self):
+        super().__init__(ReentrantCallbackGroup())
+        self.ready, self.ran = False, 0
+
+    def __enter__(self):
+        pass
+
+    def __exit__(self, *_):
+        pass
+
+    def is_ready(self, wait_set):
+        return self.ready
+
+    def take_data(self):
+        self.ready = False
+
+    async def execute(self, taken_data):
+        self.ran += 1
+
+    def get_num_entities(self):
+        return NumberOfEntities()
+
+    def add_to_wait_set(self, wait_set):
+        pass
+
+
+def test_a_waitable_without_entities_is_asked_when_the_executor_is_woken(
+        make_executor, make_node, spinning):
+    node, bare = make_node(), Bare()
+    node.add_waitable(bare)
+    executor = make_executor(nodes=[node])
+    with spinning(executor):
+        for _ in range(3):
+            assert wait_for(lambda: is_idle(executor))
+            bare.ready = True
+            executor.wake()
+            assert wait_for(lambda: not bare.ready)
+        assert wait_for(lambda: bare.ran == 3)
 
 
 # --- timers --------------------------------------------------------------------------------------

@@ -118,14 +118,14 @@ may not check
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-True]'),
         every=True),
     Case('groups_ignored', [(
-        'executor/entity.py', 'self.group = group', 'self.group = -1'), (
+        'executor/registry.py', 'self._number(rclpy_entity if decides else group)', '-1'), (
         'executor/registry.py', 'entity.exclusive = group', 'pass')], of(
         'test_executor.py', 'test_mutually_exclusive_group_is_kept')),
     Case('rad_is_fifo', [(
         'core/policies.py', "Policy('rad', key_rad,", "Policy('rad', key_fifo,")], of(
         'test_deadlines.py', 'test_ready_callbacks_run_in_the_policys_order[rad-abc]')),
     Case('depth_not_kept', [(
-        'executor/entity.py', 'self.depth = depth', 'self.depth = 0')], of(
+        'executor/sources.py', 'self.depth = qos.depth', 'self.depth = 0')], of(
         'test_executor.py',
         'test_messages_that_a_group_keeps_waiting_are_as_many_as_the_qos_says')),
     Case('every_twentieth_response_lost', [(
@@ -173,13 +173,13 @@ client.completed = getattr(client, 'completed', 0) + 1
                 'coroutine'))), every=True, at_once=True),
     Case('exceptions_of_takes_swallowed', [
         (f'executor/{file}.py', text, 'pass') for file, text in (
-            ('sources', 'self._fail(error)'), ('waitables', 'self._pool.fail(error)'))],
+            ('sources', 'self.rooms.pool.fail(error)'), ('waitables', 'self._pool.fail(error)'))],
         of('test_spin.py', 'test_an_exception_comes_out_of_spin[take]'), at_once=True),
     Case('create_task_does_not_wake_workers', [(
         'executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED)], of(
         'test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
     Case('rest_not_collected', [(
-        'executor/sources.py', 'entity.collect_more = partial(self.collect, MANY)', 'pass')], of(
+        'executor/sources.py', 'self.collect_more = partial(self.collect, MANY)', 'pass')], of(
         'test_bounds.py', 'test_few_wait_in_python_and_none_is_lost[requests]')),
     Case('subscriptions_that_publishing_threads_took_from_stay_silent', [
         ('executor/loop.py', 'self._set_mask(sources, _EDGE)', 'pass')], of(
