@@ -310,6 +310,17 @@ class Done(NamedTuple):
         return json.loads(self.stdout)
 
 
+def check_json(arguments, done, folder=None):
+    """Check the result that a command has written, if it has: no key missing or unknown."""
+    words = [*map(str, arguments)]
+    if '--json' in words[:-1] and done.returncode in (0, 1):
+        path = Path(folder or '', words[words.index('--json') + 1])
+        text = done.stdout if path.name == '-' else path.read_text() if path.is_file() else ''
+        if text:
+            from .json_results import check_result  # needs a package of the tests
+            check_result(' '.join(words[:2 if words[0] == 'graph' else 1]), json.loads(text))
+
+
 @pytest.fixture
 def graph(tmp_path, request):
     """Give the declaration `GRAPH` of the test's module as a file, graph.yaml."""
@@ -330,7 +341,9 @@ def call(capsys, monkeypatch):
             given = stdin if isinstance(stdin, bytes) else stdin.encode()
             patch.setattr('sys.stdin', io.TextIOWrapper(io.BytesIO(given), encoding='utf-8'))
             status = main([*map(str, arguments)])
-        return Done(status, *capsys.readouterr())
+            done = Done(status, *capsys.readouterr())
+            check_json(arguments, done)
+        return done
     return run
 
 
@@ -358,5 +371,7 @@ def mddag():
             except BaseException:
                 process.kill()
                 raise
-        return Done(process.returncode, out, err)
+        done = Done(process.returncode, out, err)
+        check_json(arguments, done, options.get('cwd'))
+        return done
     return call

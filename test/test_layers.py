@@ -20,7 +20,7 @@ TOP = Path(__file__).resolve().parent.parent
 
 LEVELS = {part: level for level, parts in enumerate((
     ('msg_graph',), ('mddag_executor.errors', 'mddag_executor.memory', 'mddag_executor.defaults',
-                     'mddag_executor.text'),
+                     'mddag_executor.text', 'mddag_executor.results'),
     ('mddag_executor.resources',),
     ('mddag_executor',),  # its __init__.py, to those who want the version
     ('mddag_executor.core', 'mddag_executor.trace'),

@@ -18,9 +18,16 @@ from mddag_executor.analysis.usage import group_waits, share, Usage
 from mddag_executor.core import NEVER
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.tables import Recording
+from mddag_executor.results.replays import (
+    RecordedFile,
+    ReplayedDag,
+    ReplayResult,
+    ReplayResultRare,
+)
+from mddag_executor.results.sinks import DagCounts, SinkCounts, SlackTimes
 from mddag_executor.sources.open import Given, open_recording, Progress
 from mddag_executor.text import counted
-from msg_graph import TaskSet
+from msg_graph import Dag, TaskSet
 from msg_graph.drift import Drift
 
 
@@ -98,44 +105,51 @@ class Replay:
         return max(0, recording.end - (
             start if len(recording.releases) else min(start, begun)))
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> ReplayResult:
         """Return the result format of ``replay --json``."""
         recording, head, duration = self.recording, self.recording.head, self.duration_ns
         paths = self.paths.results()    # first, because they need the most memory
-        requirements = self.requirements.result()
-        result = {
+        guesses: ReplayResultRare = {}
+        if guessed := recording.guessed:
+            guesses['guessed'] = guessed
+        more: ReplayResultRare = {}
+        if requirements := self.requirements.result():
+            more['requirements'] = requirements
+        if recording.imported:
+            more['recorded_callbacks'] = recorded_callbacks(recording)
+            more['communications'] = communications(recording)
+        verdicts = self.tally.result()
+        return {
             'policy': head.policy, 'workers': head.workers, 'preemptive': head.preemptive,
             'duration_ns': duration,
             'utilisation': share(self.usage.busy, head.workers, duration),
-            **self.tally.result()}
-        breakdown, unjudged = self.chains.breakdown(), recording.unjudged
-        for dag in self.task_set.dags:
-            sinks = result['dags'][dag.name]['sinks']
-            first = self.judged.tables.first_vertex[dag.index]
-            for local in dag.sinks:
-                sink = sinks[dag.vertices[local].name]
-                sink['breakdown'] = breakdown.get(first + local)
-                sink['slack_ns'] = slack(sink)
-            if unjudged is not None:
-                result['dags'][dag.name]['unjudged'] = unjudged.get(dag.index, 0)
-        return {
-            **result, 'rescheduled': False, 'skip_ns': self.judged.skip,
+            **verdicts, 'dags': {
+                dag.name: self._dag_result(dag, verdicts['dags'][dag.name])
+                for dag in self.task_set.dags},
+            'rescheduled': False, 'skip_ns': self.judged.skip,
             'callbacks': self.usage.callbacks(),
             'undeclared': self.usage.undeclared(),
             'worker_use': self.usage.workers(head.workers),
             'dropped': dict(sorted(recording.dropped.items())),
             'messages_lost': recording.messages_lost,
-            **({'guessed': guessed} if (guessed := recording.guessed) else {}),
-            'misses': self.explanation.summary(),
-            'paths': paths, **({'requirements': requirements} if requirements else {}),
-            **({} if not recording.imported else {
-                'recorded_callbacks': recorded_callbacks(recording),
-                'communications': communications(recording)}),
+            **guesses, 'misses': self.explanation.summary(),
+            'paths': paths, **more,
             'recording': recording_result(recording),
             'warnings': self.warnings}
 
+    def _dag_result(self, dag: Dag, counts: DagCounts) -> ReplayedDag:
+        breakdown, first = self.chains.breakdown(), self.judged.tables.first_vertex[dag.index]
+        places = {dag.vertices[local].name: first + local for local in dag.sinks}
+        found: ReplayedDag = {
+            'jobs': counts['jobs'], 'ends': counts['ends'], 'sinks': {
+                name: {**sink, 'breakdown': breakdown.get(places[name]), 'slack_ns': slack(sink)}
+                for name, sink in counts['sinks'].items()}}
+        if self.recording.unjudged is not None:
+            found['unjudged'] = self.recording.unjudged.get(dag.index, 0)
+        return found
 
-def slack(sink: dict[str, Any]) -> dict[str, int] | None:
+
+def slack(sink: SinkCounts) -> SlackTimes | None:
     """
     Return the slack of a sink: deadline minus completion, ns; negative for late jobs.
 
@@ -144,17 +158,21 @@ def slack(sink: dict[str, Any]) -> dict[str, int] | None:
     response, deadline = sink['response_ns'], sink['relative_deadline_ns']
     if response is None:
         return None
-    return {name: deadline - response[of] for name, of in (
-        ('min', 'max'), ('p1', 'p99'), ('median', 'median'), ('max', 'min'))}
-
-
-def recording_result(run: Recording) -> dict[str, Any]:
-    """Return the part of a result that describes the trace."""
     return {
+        'min': deadline - response['max'], 'p1': deadline - response['p99'],
+        'median': deadline - response['median'], 'max': deadline - response['min']}
+
+
+def recording_result(run: Recording) -> RecordedFile:
+    """Return the part of a result that describes the trace."""
+    found: RecordedFile = {
         'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
-        'end_ns': run.end, **(
-            {'shut_down': run.shut_down, 'lost': run.lost} if run.messages is None
-            else {'messages': run.messages})}
+        'end_ns': run.end}
+    if run.messages is None:
+        found.update({'shut_down': run.shut_down, 'lost': run.lost})
+    else:
+        found['messages'] = run.messages
+    return found
 
 
 def replay(

@@ -34,13 +34,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, cast, NamedTuple
 
 from mddag_executor.analysis.deadlines import Judged
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
 from mddag_executor.recording.columns import concatenate, rows, Table
 from mddag_executor.recording.tables import EXECUTIONS, Ints, LEG, Mask, rows_by, sort_by
+from mddag_executor.results.replays import Breakdown, ChainLink, ResponseParts, WorstJob
 from msg_graph import TaskSet
 from msg_graph.model import topological_order
 import numpy as np
@@ -121,7 +122,7 @@ class Chains:
         for jobs in judged.jobs:
             self._is_other[jobs.done] = False
         self._dags: dict[int, tuple[Any, Any]] = {}
-        self._breakdown: dict[int, dict[str, Any]] = {}
+        self._breakdown: dict[int, Breakdown] = {}
 
     # --- links -----------------------------------------------------------------------------------
 
@@ -246,7 +247,7 @@ class Chains:
 
     # --- breakdown -------------------------------------------------------------------------------
 
-    def breakdown(self) -> dict[int, dict[str, Any]]:
+    def breakdown(self) -> dict[int, Breakdown]:
         """Return by sink the breakdown of its completed jobs: means, and the worst job."""
         for dag in range(len(self._legs)):
             self._of_dag(dag)
@@ -276,12 +277,13 @@ class Chains:
             dag, np.flatnonzero(chain.known[worst:worst + 1]), np.array([v]),
             job[worst:worst + 1])
         self._breakdown[sink] = {
-            'mean': {name: round(int(part.sum()) / n) for name, part in parts.items()},
-            'worst': {
+            'mean': cast(ResponseParts, {
+                name: round(int(part.sum()) / n) for name, part in parts.items()}),
+            'worst': cast(WorstJob, {
                 'job': int(done['job'][worst]), 'release_ns': int(done['release'][worst]),
                 'completed_ns': int(completed[worst]),
                 **{name: int(part[worst]) for name, part in parts.items()},
-                'chain': [_step_result(self._judged.task_set, each[0]) for each in links][::-1]}}
+                'chain': [_step_result(self._judged.task_set, each[0]) for each in links][::-1]})}
 
 
 def _published(several: Sequence[_Chain], leg: Ints, ready: Ints) -> tuple[Ints, _Chain]:
@@ -310,7 +312,7 @@ def _answers_from(ready: Ints, start: Ints, published: Ints) -> Ints:
     return found
 
 
-def _step_result(task_set: TaskSet, link: Any) -> dict[str, Any]:
+def _step_result(task_set: TaskSet, link: Any) -> ChainLink:
     known = link['leg'] >= 0
     return {
         'vertex': task_set.vertices[int(link['vertex'])].name, 'ready_ns': int(link['ready']),

@@ -4,18 +4,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from mddag_executor.analysis.spread import spread, sum_of
+from mddag_executor.analysis.spread import spread_of, sum_of
 from mddag_executor.recording.tables import different, Recording, rows_by
+from mddag_executor.results.replays import Communication, RecordedCallback
 import numpy as np
 
 
-def recorded_callbacks(recording: Recording) -> dict[str, dict[str, int]]:
+def recorded_callbacks(recording: Recording) -> dict[str, RecordedCallback]:
     """Return counts and times (ns) of each recorded callback that ran."""
     start, end = (recording.executions[name] for name in ('start', 'end'))
     numbers, index = different(recording.executions['callback'])
-    found = {}
+    found: dict[tuple[str, int], RecordedCallback] = {}
     for number, mine in zip(numbers.tolist(), rows_by(index, len(numbers))):
         ended = mine[end[mine] >= 0]
         took = end[ended] - start[ended]
@@ -26,9 +25,10 @@ def recorded_callbacks(recording: Recording) -> dict[str, dict[str, int]]:
     return {label: each for (label, _), each in sorted(found.items(), key=lambda item: item[0])}
 
 
-def communications(recording: Recording) -> list[dict[str, Any]]:
+def communications(recording: Recording) -> list[Communication]:
     """Return by publisher and callback the messages, and times from publication to start."""
-    table, messages, found = recording.executions, recording.publications, []
+    table, messages = recording.executions, recording.publications
+    found: list[Communication] = []
     started = np.flatnonzero(table['message'] >= 0)
     message = messages[table['message'][started]]
     known = (message['publisher'] >= 0) & (message['time'] > 0)
@@ -46,5 +46,5 @@ def communications(recording: Recording) -> list[dict[str, Any]]:
             'topic': publisher.topic,
             'publisher': publisher.node.name if publisher.node is not None else None,
             'callback': recording.who.name(int(table['callback'][started[mine[0]]])),
-            'sent': sent[number], 'arrived': len(mine), 'latency_ns': spread(latency[mine])})
+            'sent': sent[number], 'arrived': len(mine), 'latency_ns': spread_of(latency[mine])})
     return sorted(found, key=lambda each: (each['topic'], each['callback']))

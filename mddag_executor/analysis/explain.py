@@ -45,6 +45,14 @@ from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.columns import concatenate, in_parts, rows, Table
 from mddag_executor.recording.tables import different, Ints, Mask, Recording, rows_by, VERTEX
+from mddag_executor.results.replays import (
+    ExplainResult,
+    ExplainResultRare,
+    LatePath,
+    MissedJob,
+    Misses,
+    MissPart,
+)
 from msg_graph.model import topological_order
 import numpy as np
 
@@ -338,7 +346,7 @@ class Explanation:
 
     # --- results ---------------------------------------------------------------------------------
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Misses:
         """Return the number of misses by cause, in total and by sink, and the stops."""
         names = [v.name for v in self._task_set.vertices]
         return {
@@ -349,11 +357,22 @@ class Explanation:
             'stalls': [{'at_ns': begin, 'length_ns': end - begin,
                         'misses': self._in_stops[begin, end]} for begin, end in self.stops]}
 
-    def result(self, sink: int | None = None, job: int | None = None) -> dict[str, Any]:
-        """Return the result format of ``explain --json``, of one (global) sink or job only."""
-        return {**self.summary(), 'jobs': list(self._jobs(sink, job))}
+    def result(
+        self, sink: int | None = None, job: int | None = None,
+        requirements: dict[str, dict[str, LatePath]] | None = None,
+    ) -> ExplainResult:
+        """
+        Return the result format of ``explain --json``.
 
-    def _jobs(self, sink: int | None, job: int | None) -> Iterator[dict[str, Any]]:
+        :param sink: a global vertex, to explain its misses only; ``job``: likewise.
+        :param requirements: where the time of late results of paths went.
+        """
+        more: ExplainResultRare = {}
+        if requirements:
+            more['requirements'] = requirements
+        return {**self.summary(), 'jobs': list(self._jobs(sink, job)), **more}
+
+    def _jobs(self, sink: int | None, job: int | None) -> Iterator[MissedJob]:
         missed, parts = self.found.misses, self.found.parts
         wanted = np.ones(len(missed), dtype=np.bool_)
         for column, value in (('sink', sink), ('job', job)):
@@ -375,9 +394,9 @@ class Explanation:
                     self._part(i, number)
                     for i in range(first[miss], first[miss + 1])]}
 
-    def _part(self, place: int, job: int) -> dict[str, Any]:
+    def _part(self, place: int, job: int) -> MissPart:
         part = self.found.parts[place]
-        found = {
+        found: MissPart = {
             'vertex': self._task_set.vertices[int(part['vertex'])].name,
             'cause': PARTS[part['cause']], 'ns': int(part['ns']), 'behind': [
                 {'callback': self._names[callback], 'ns': took}
@@ -415,7 +434,7 @@ class Explanation:
                 self._names[max(took, key=lambda callback: (took[callback], -callback))]
                 for miss, took in waits.items()}
 
-    def worst(self) -> dict[str, Any] | None:
+    def worst(self) -> MissedJob | None:
         """Return the latest job; if none completed, the first miss."""
         every = self.found.misses
         if not len(every):

@@ -52,7 +52,7 @@ documentation of its response time cases.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, cast, NamedTuple
 
 from mddag_executor.analysis.spread import spread
 from mddag_executor.recording.columns import concatenate, rows, Table
@@ -68,6 +68,7 @@ from mddag_executor.recording.tables import (
     rows_by,
     sort_by,
 )
+from mddag_executor.results.replays import PathResult, PathTimes, ResponseCases
 from msg_graph import Callback, Path
 from msg_graph.segments import hops, may_end
 import numpy as np
@@ -375,7 +376,7 @@ class Paths:
         there = (made != NONE) & (message != NONE)
         return _Timeline(time, made), np.column_stack((message, time, made))[there]
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> dict[str, PathResult]:
         """
         Return by path its end-to-end times, ns.
 
@@ -385,7 +386,7 @@ class Paths:
         ``reaction_time`` is the worst case with external latency, ``data_age`` that of every
         output.
         """
-        found = {}
+        found: dict[str, PathResult] = {}
         for number, (path, path_hops) in enumerate(zip(self.paths, self.hops)):
             flows = self.flows(number)
             judged = flows.begin >= self._judge_from if self._judge_from > -_NEVER else slice(None)
@@ -491,7 +492,7 @@ def flows_of(steps: Table, may_end: Mask) -> Flows:
     return found._replace(first=np.where(found.first == NONE, found.begin, found.first))
 
 
-def figures(start: Ints, end: Ints) -> dict[str, Any]:
+def figures(start: Ints, end: Ints) -> PathTimes:
     """
     Return the statistics of CARET's cases, of reaction time and data age.
 
@@ -499,9 +500,9 @@ def figures(start: Ints, end: Ints) -> dict[str, Any]:
     :param end: end of each flow; -1: it did not arrive.
     """
     times = {name: spread(each) for name, each in cases(start, end).items()}
-    data_age = times.pop('data_age')
-    return {'response_time': times, 'reaction_time': times['worst_with_external_latency'],
-            'data_age': data_age}
+    return {
+        'response_time': cast(ResponseCases, {name: times[name] for name in _CASES}),
+        'reaction_time': times['worst_with_external_latency'], 'data_age': times['data_age']}
 
 
 def cases(start: Ints, end: Ints) -> dict[str, Ints]:

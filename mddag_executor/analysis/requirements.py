@@ -10,7 +10,6 @@ The rules are those of ``core.requirements``, applied to all flows of a path at 
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
 
 from mddag_executor.analysis.paths import Flows, NONE, Paths
 from mddag_executor.core import NEVER
@@ -18,6 +17,8 @@ from mddag_executor.core.requirements import RequirementTally, Rules
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_NOT_DUE
 from mddag_executor.recording.columns import concatenate, rows, Table
 from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by
+from mddag_executor.results.replays import LatePart, LatePath
+from mddag_executor.results.sinks import Requirements as Results
 from msg_graph import Path
 import numpy as np
 
@@ -116,9 +117,9 @@ class Requirements:
         return concatenate([found, rows(
             RESULTS, missing, kind=SINK_MISSED, since=last, end=NONE, step=NONE)])
 
-    def result(self) -> dict[str, dict[str, Any]]:
+    def result(self) -> Results:
         """Return by path, and 'reaction' or 'age', its result in the format of a sink."""
-        found: dict[str, dict[str, Any]] = {}
+        found: Results = {}
         for (number, what), table in self.results.items():
             path = self._paths.paths[number]
             tally = RequirementTally(path, path.requirements[what])
@@ -128,7 +129,7 @@ class Requirements:
 
     # --- where the time went ---------------------------------------------------------------------
 
-    def breakdown(self) -> dict[str, dict[str, Any]]:
+    def breakdown(self) -> dict[str, dict[str, LatePath]]:
         """
         Return where the time of late reactions and ages went: by path and requirement.
 
@@ -136,7 +137,7 @@ class Requirements:
         order: the callback, what happened, the ``mean_ns`` of the late ones, and ``worst_ns``,
         that of the latest.  ``unanswered`` are changes without output, and missing outputs.
         """
-        found: dict[str, dict[str, Any]] = {}
+        found: dict[str, dict[str, LatePath]] = {}
         for number, path in enumerate(self._paths.paths):
             mine = {what: self.results[number, what] for what in path.requirements}
             if not any((table['kind'] != SINK_IN_TIME).any() for table in mine.values()):
@@ -153,7 +154,7 @@ class Requirements:
 
     def _parts(
         self, path: Path, number: int, steps: Table, late: Table
-    ) -> list[dict[str, Any]]:
+    ) -> list[LatePart]:
         if not len(late):
             return []
         last = len(path.callbacks)
@@ -170,7 +171,7 @@ class Requirements:
             more = of['parent'] != NONE
             which, step = which[more], of['parent'][more]
         longest = int((late['end'] - late['since']).argmax())
-        found: list[dict[str, Any]] = []
+        found: list[LatePart] = []
 
         def add(key: str, what: str, times: Ints) -> None:
             if times.any():

@@ -4,17 +4,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from mddag_executor.core import quantile
 from mddag_executor.recording.tables import Ints
+from mddag_executor.results.replays import Spread
 import numpy as np
 
 
-def spread(times: Ints) -> dict[str, Any] | None:
+def spread(times: Ints) -> Spread | None:
     """Return count, min, mean, median, p99 and max of times, ns; None without times."""
-    if not len(times):
-        return None
+    return spread_of(times) if len(times) else None
+
+
+def spread_of(times: Ints) -> Spread:
+    """Return count, min, mean, median, p99 and max of times, ns; there is at least one."""
     ordered = memoryview(np.sort(times))
     return {
         'count': len(ordered), 'min': ordered[0], 'mean': round(sum_of(times) / len(ordered)),

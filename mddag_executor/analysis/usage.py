@@ -17,7 +17,7 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 from mddag_executor.analysis.spans import Spans
 from mddag_executor.recording.columns import in_parts, Table
@@ -31,6 +31,7 @@ from mddag_executor.recording.tables import (
     sort_by,
     UNKNOWN,
 )
+from mddag_executor.results.replays import CallbackUse, OverTime, WorkerUse
 import numpy as np
 
 NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
@@ -153,7 +154,7 @@ class PoolUse:
             busy += Spans(*each).within(steps[:-1], steps[1:])
         self.busy = busy.tolist()
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> OverTime:
         """Return the length of steps, the first begin, and the busy time of each, ns."""
         return {'step_ns': self.step, 'start_ns': self.start, 'busy_ns': self.busy}
 
@@ -234,19 +235,20 @@ class Usage:
         """Update the longest times of callbacks by index."""
         np.maximum.at(self._table[NAMES.index(name)], places, times)
 
-    def callbacks(self) -> dict[str, dict[str, int]]:
+    def callbacks(self) -> dict[str, CallbackUse]:
         """Return the usage of each declared callback, in file order."""
         return {key: self._result(place) for key, place in self._places.items()}
 
-    def undeclared(self) -> dict[str, int]:
+    def undeclared(self) -> CallbackUse:
         """Return the usage of all undeclared callbacks together."""
         return self._result(-1)
 
-    def _result(self, place: int) -> dict[str, int]:
+    def _result(self, place: int) -> CallbackUse:
         column = self._table[:, place].tolist()
-        return dict(zip(NAMES, column if column[_MEASURED] else column[:_MEASURED]))
+        return cast(CallbackUse, dict(zip(
+            NAMES, column if column[_MEASURED] else column[:_MEASURED])))
 
-    def workers(self, count: int) -> dict[str, Any]:
+    def workers(self, count: int) -> WorkerUse:
         """Return how busy the workers were; ``lent`` is the time of blocking calls."""
         return {
             'busy_ns': {str(w): busy for w, busy in sorted(self.by_worker.items())},

@@ -11,13 +11,14 @@ imported one by the other run's.
 from __future__ import annotations
 
 import argparse
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.recorded import Source
 from mddag_executor.cli.text import warn
 
 if TYPE_CHECKING:
+    from mddag_executor.results.replays import ReplayResult
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -70,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
 
 def _results(
     args: argparse.Namespace, first: Source, second: Source
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[ReplayResult, ReplayResult]:
     if _has_declaration(first):
         before, declared = _result(first, args.begin or 0)
         if not _has_declaration(second):
@@ -91,7 +92,7 @@ def _has_declaration(source: Source) -> bool:
         not source.is_bag and has_declaration(source.path, source.name))
 
 
-def _result(source: Source, skip: int) -> tuple[dict[str, Any], TaskSet]:
+def _result(source: Source, skip: int) -> tuple[ReplayResult, TaskSet]:
     outcome = recorded.as_recorded(source, f'replaying {source.name}', skip)
     warn(*outcome.warnings)
     return outcome.result(), outcome.task_set

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common, options, recorded, verdicts
 from mddag_executor.cli.text import printable, warn
@@ -18,6 +18,7 @@ from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
     from mddag_executor.analysis.as_recorded import Replay
+    from mddag_executor.results.replays import LatePath, MissedJob
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -50,11 +51,9 @@ def main(args: argparse.Namespace) -> int:
     if args.job is not None:
         _check_job(args.job, outcome, sink)
     warn(*outcome.warnings)
-    result = outcome.explanation.result(sink, args.job)
     every = sink is None and args.job is None
     late_paths = outcome.requirements.breakdown() if every else {}
-    if late_paths:
-        result['requirements'] = late_paths
+    result = outcome.explanation.result(sink, args.job, late_paths)
     common.show(args, result, (
         _lines(outcome, late_paths) if every else _job_lines(result['jobs'])))
     verdicts.check_judged(outcome.result()['dags'], str(args.trace))
@@ -87,7 +86,7 @@ def _check_job(job: int, outcome: Replay, sink: int | None) -> None:
                 else ', since no job was released: leave --job out'))
 
 
-def _lines(outcome: Replay, late_paths: dict[str, Any]) -> Iterator[str]:
+def _lines(outcome: Replay, late_paths: dict[str, dict[str, LatePath]]) -> Iterator[str]:
     from mddag_executor.report.explained import (
         causes_line,
         causes_table,
@@ -113,7 +112,7 @@ def _lines(outcome: Replay, late_paths: dict[str, Any]) -> Iterator[str]:
     yield from causes_line(summary)
 
 
-def _job_lines(jobs: list[dict[str, Any]]) -> Iterator[str]:
+def _job_lines(jobs: list[MissedJob]) -> Iterator[str]:
     from mddag_executor.report.explained import job_lines
     for each in jobs[:MOST_SHOWN]:
         yield from job_lines(each)

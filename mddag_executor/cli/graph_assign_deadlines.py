@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
@@ -15,6 +15,7 @@ from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.laboratory.assign_deadlines import Measured
+    from mddag_executor.results.graphs import AssignResult, AssignResultRare, Bound
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -55,13 +56,14 @@ def main(args: argparse.Namespace) -> int:
     deadlines, measured = _assign(args, task_set)
     common.write_text(args.output, deadlines_in_text(task_set, deadlines))
     after = with_deadlines(task_set, deadlines)
-    required = {
+    required: dict[str, dict[str, Bound]] = {
         path.name: {what: {'required_ns': time, 'bound_ns': bound(after, path, what)}
                     for what, time in path.requirements.items()}
         for path in after.paths if path.requirements}
-    result: dict[str, Any] = {
-        'policy': args.policy, 'budget': args.budget, 'deadlines_ns': deadlines,
-        **({'requirements': required} if required else {}), 'acceptance': measured.result()}
+    more: AssignResultRare = {'requirements': required} if required else {}
+    result: AssignResult = {
+        'policy': args.policy, 'budget': args.budget, 'deadlines_ns': deadlines, **more,
+        'acceptance': measured.result()}
     common.show(args, result, _lines(args, task_set, result, measured), tables_to_stderr=True)
     return 0
 
@@ -80,7 +82,7 @@ def _assign(args: argparse.Namespace, task_set: TaskSet) -> tuple[dict[str, int]
 
 
 def _lines(
-    args: argparse.Namespace, task_set: TaskSet, result: dict[str, Any], measured: Measured,
+    args: argparse.Namespace, task_set: TaskSet, result: AssignResult, measured: Measured,
 ) -> Iterator[str]:
     from mddag_executor.report.tables import bounds_table, short_names
     deadlines = result['deadlines_ns']

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import asdict
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
@@ -20,6 +19,7 @@ from mddag_executor.cli.text import Cell, format_ns, table, warn
 from mddag_executor.text import counted, listed
 
 if TYPE_CHECKING:
+    from mddag_executor.results.graphs import Bound, CheckedDag, CheckResult, CheckResultRare
     from msg_graph import Dag, TaskSet
 
 EXAMPLE = """\
@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
     return int(args.fail_on_unschedulable and not all(test['holds'] for test in tests))
 
 
-def check_result(task_set: TaskSet, workers: int, budget: str) -> dict[str, Any]:
+def check_result(task_set: TaskSet, workers: int, budget: str) -> CheckResult:
     """
     Return the result of `graph check` for machines.
 
@@ -82,17 +82,18 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> dict[str, Any]
     from mddag_executor.laboratory.necessary import necessary_tests
     from msg_graph.segments import bound
     tables = Tables.build(task_set)
-    dags = {}
+    dags: dict[str, CheckedDag] = {}
     for dag in task_set.dags:
         first = tables.first_vertex[dag.index]
         offsets = tables.rad_offset[first:first + len(dag.vertices)]
         dags[dag.name] = _dag_result(dag, offsets, workers)
-    loads = [dag['load'] for dag in dags.values()]
-    load = None if None in loads else sum(loads)
-    required = {
+    loads = [dag['load'] for dag in dags.values() if dag['load'] is not None]
+    load = sum(loads) if len(loads) == len(dags) else None
+    required: dict[str, dict[str, Bound]] = {
         path.name: {what: {'required_ns': time, 'bound_ns': bound(task_set, path, what)}
                     for what, time in path.requirements.items()}
         for path in task_set.paths if path.requirements}
+    more: CheckResultRare = {'requirements': required} if required else {}
     return {
         'dags': dags,
         'vertices': len(task_set.vertices),
@@ -102,16 +103,18 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> dict[str, Any]
         'utilisation': None if load is None else load / workers,
         'budget': budget,
         'tests': [] if load is None or not task_set.dags else [
-            asdict(verdict) for verdict in necessary_tests(task_set, workers, budget)],
+            {'test': each.test, 'holds': each.holds, 'figure': each.figure,
+             'reason': each.reason, 'details': each.details}
+            for each in necessary_tests(task_set, workers, budget)],
         'queue_edges': [
             {'reader': edge.reader, 'topic': edge.topic, 'writers': list(edge.writers)}
             for edge in task_set.queue_edges],
         'paths': {path.name: list(path.callbacks) for path in task_set.paths},
-        **({'requirements': required} if required else {}),
+        **more,
     }
 
 
-def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> dict[str, Any]:
+def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> CheckedDag:
     from msg_graph.model import load_of, mean_execution_times, path_lengths
     means, load = mean_execution_times(dag), load_of(dag)
     return {
@@ -137,7 +140,7 @@ def _backlog(dag: Dag, load: float | None) -> Iterator[str]:
                "'max_active_jobs:' to its source, if old data is of no use")
 
 
-def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
+def _warnings(task_set: TaskSet, result: CheckResult) -> Iterator[str]:
     for test in result['tests']:
         if test['holds']:
             continue
@@ -158,7 +161,7 @@ def _warnings(task_set: TaskSet, result: dict[str, Any]) -> Iterator[str]:
                'this machine can do, unless callbacks wait instead of computing')
 
 
-def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
+def _rows(result: CheckResult) -> Iterator[list[Cell]]:
     from mddag_executor.report.tables import short_names
     short = short_names(sink for dag in result['dags'].values() for sink in dag['sinks'])
     for name, dag in result['dags'].items():
@@ -171,13 +174,13 @@ def _rows(result: dict[str, Any]) -> Iterator[list[Cell]]:
             yield [*of_dag, short[sink], 'none' if deadline is None else format_ns(deadline)]
 
 
-def _bounds(result: dict[str, Any]) -> Iterator[str]:
+def _bounds(result: CheckResult) -> Iterator[str]:
     from mddag_executor.report.tables import bounds_table
     if 'requirements' in result:
         yield bounds_table(result['requirements'])
 
 
-def _tests(result: dict[str, Any]) -> Iterator[str]:
+def _tests(result: CheckResult) -> Iterator[str]:
     if result['tests']:
         yield table(
             ('test', 'verdict', f'figure ({result["budget"]} execution times)'),
@@ -185,7 +188,7 @@ def _tests(result: dict[str, Any]) -> Iterator[str]:
              for test in result['tests']))
 
 
-def _summary(task_set: TaskSet, result: dict[str, Any]) -> str:
+def _summary(task_set: TaskSet, result: CheckResult) -> str:
     text = (
         f'{counted(len(task_set.dags), "DAG")}, '
         f'{counted(result["vertices"], "vertex", "vertices")}, '

@@ -6,12 +6,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.recorded import as_recorded, Source
 from mddag_executor.cli.text import Cell, one_line, table
 from msg_graph import TaskSet
+
+if TYPE_CHECKING:
+    from mddag_executor.results.graphs import PlaceResult
 
 EXAMPLE = """\
 mddag graph place graph.yaml run.mcap --processes 3 -o placed.yaml
@@ -62,8 +65,8 @@ def main(args: argparse.Namespace) -> int:
     place = placing.place()
     processes = placing.processes(place)
     loads = placing.loads(place)
-    result = {
-        'processes': [{'name': p.name, 'nodes': p.nodes} for p in processes],
+    result: PlaceResult = {
+        'processes': [{'name': p.name, 'nodes': list(p.nodes)} for p in processes],
         'loads': [loads[place[placing.block_of(p.nodes[0])]] for p in processes]}
     common.write_text(args.output, with_processes(task_set, processes).text)
     common.show(args, result, _lines(result), tables_to_stderr=True)
@@ -93,7 +96,7 @@ def _recorded(source: Source) -> tuple[list[list[int]], TaskSet]:
     return [[times[v.callback.key] for v in dag.vertices] for dag in task_set.dags], judged
 
 
-def _lines(result: dict[str, Any]) -> Iterator[str]:
+def _lines(result: PlaceResult) -> Iterator[str]:
     rows: list[list[Cell]] = [
         [process['name'], len(process['nodes']), f'{load:.2f}',
          one_line(', '.join(process['nodes'][:3]))

@@ -52,7 +52,7 @@ def main(args: argparse.Namespace) -> int:
     outcome = recorded.outcome_of(args, recorded.source_of(args))
     drift = outcome.drift() if isinstance(outcome, Replay) else []
     warn(*outcome.warnings)
-    result = outcome.result()
+    result: dict[str, Any] = {**outcome.result()}
     if not args.reschedule:
         result['drift'] = [each.result() for each in drift]
     status = verdicts.judge(args, result)

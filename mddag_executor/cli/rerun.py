@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, redirect_stdout
 import os
 import sys
-from typing import Any, BinaryIO, TYPE_CHECKING
+from typing import BinaryIO, TYPE_CHECKING
 
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import printable, Progress, warn
@@ -17,6 +17,7 @@ from mddag_executor.text import counted, listed
 
 if TYPE_CHECKING:
     from mddag_executor.rerun import Difference, Result
+    from mddag_executor.results.comparisons import RerunResult
 
 EXAMPLE = """\
 mddag rerun drive.mcap graph.yaml --node my_package/tracker -o before.mcap
@@ -70,9 +71,7 @@ def main(args: argparse.Namespace) -> int:
     with redirect_stdout(sys.stdout if common.wants_tables(args) else sys.stderr):
         result, found = _run(args)
     warn(*result.warnings)
-    values = result.result()
-    if found is not None:
-        values['differences'] = [each._asdict() for each in found]
+    values = result.result(found)
     differences = [printable(each.line()) for each in found or ()]
     common.show(args, values, (*_lines(args, result, values), *differences))
     if not common.wants_tables(args):
@@ -128,7 +127,7 @@ def _run(args: argparse.Namespace) -> tuple[Result, list[Difference] | None]:
 
 
 def _lines(
-    args: argparse.Namespace, result: Result, values: dict[str, Any]
+    args: argparse.Namespace, result: Result, values: RerunResult
 ) -> Iterator[str]:
     from mddag_executor.report.tables import sink_table
     yield sink_table(values['dags'])
@@ -143,5 +142,5 @@ def _lines(
         yield f'{counted(len(result.recorded_topics), "topic")} also recorded, {same} the same'
     for difference in result.recorded:
         yield f'not as recorded: {printable(difference.line())}'
-    if args.expect is not None and not values['differences']:
+    if args.expect is not None and not values.get('differences'):
         yield f'the same as {printable(args.expect)}'

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, verdicts
@@ -19,6 +19,8 @@ from mddag_executor.cli.text import format_ns, printable, Progress
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
+    from mddag_executor.results.replays import PathsResult
+    from mddag_executor.results.simulations import SimulateResult
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -63,11 +65,11 @@ def main(args: argparse.Namespace) -> int:
     if args.report is not None:
         from mddag_executor.report.html import of_run
         common.write_report(args.report, of_run(task_set, load, run))
-    paths: dict[str, Any] = {}
+    paths: PathsResult = {}
     if required:
         from mddag_executor.whatif.computed import ComputedRun
         paths = ComputedRun.of_run(task_set, load, run).requirements()
-    result = {
+    result: SimulateResult = {
         **run.result(), **paths, 'file': task_set.file, 'judge': run.settings.judge,
         'seed': args.seed if args.execution_times is None else None, 'ended_ns': run.ended_ns,
         'trace': args.trace}
@@ -94,7 +96,7 @@ def execution_times(
     return times
 
 
-def _lines(result: dict[str, Any]) -> Iterator[str]:
+def _lines(result: SimulateResult) -> Iterator[str]:
     from mddag_executor.report.tables import requirement_table, run_lines, sink_table
     yield sink_table(result['dags'])
     if result.get('requirements'):

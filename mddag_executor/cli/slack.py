@@ -12,7 +12,7 @@ A recorded run is rescheduled (see `replay --reschedule`), a declaration is simu
 from __future__ import annotations
 
 import argparse
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options, recorded, simulate, verdicts
@@ -21,6 +21,7 @@ from mddag_executor.core.tally import total
 from mddag_executor.errors import UsageError
 
 if TYPE_CHECKING:
+    from mddag_executor.results.sinks import DagCounts
     from mddag_executor.whatif.slack import Problem
     from msg_graph import TaskSet
 
@@ -81,7 +82,7 @@ def main(args: argparse.Namespace) -> int:
         for one in result['callbacks'].values()))
 
 
-def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
+def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, DagCounts]]:
     from mddag_executor.whatif.reschedule import reschedule
     from mddag_executor.whatif.slack import Problem
     options.reject_options(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
@@ -101,7 +102,7 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any
     return problem, outcome.task_set, outcome.result()['dags']
 
 
-def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Any]]:
+def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, DagCounts]]:
     from mddag_executor.core import Tables
     from mddag_executor.simulate import periodic_load, Settings
     from mddag_executor.simulate import simulate as simulated

@@ -31,6 +31,7 @@ from typing import Any
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_NOT_DUE
 from mddag_executor.core.tally import counts, is_kept, SinkTally
 from mddag_executor.core.weakly_hard import MissWindow
+from mddag_executor.results.sinks import SinkCounts
 from mddag_executor.text import counted
 from msg_graph import format_duration, Path, TaskSet
 from msg_graph.segments import may_end, segments
@@ -99,7 +100,7 @@ class RequirementTally(SinkTally):
         if late and self._window is not None:
             self._window.add(self._results)
 
-    def result_with(self, missed: int = 0, not_due: int = 0) -> dict[str, Any]:
+    def result_with(self, missed: int = 0, not_due: int = 0) -> SinkCounts:
         """
         Return the requirement's part of the result, in the format of a sink.
 

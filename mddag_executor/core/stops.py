@@ -17,6 +17,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, NamedTuple
 
+from mddag_executor.results.runs import Stops as StopsResult
+
 LEAST_NS = 20_000_000
 """A shorter time is no stop, ns."""
 KEEP_STOPS = 100
@@ -75,7 +77,7 @@ class Stops:
         self._unexplained.append(miss)
         return False
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> StopsResult:
         """Return the stops' number, duration, explained misses, and the last stops."""
         return {
             'count': self._count, 'total_ns': self._total_ns, 'misses': self._misses,

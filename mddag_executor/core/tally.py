@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, cast, NamedTuple
 
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.state import (
@@ -38,6 +38,15 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.core.weakly_hard import MissWindow
+from mddag_executor.results.sinks import (
+    DagCounts,
+    FirstMiss,
+    JobEnds,
+    ResponseTimes,
+    SinkCounts,
+    SinkVerdicts,
+    Verdicts,
+)
 from msg_graph import Dag, TaskSet, Vertex, WeaklyHard
 
 VERDICTS = {
@@ -167,28 +176,33 @@ class SinkTally:
         self.shortest = min(self.shortest, response)
         self.longest = max(self.longest, response)
 
-    def verdicts(self) -> dict[str, int]:
+    def verdicts(self) -> SinkVerdicts:
         """Return the number of each verdict; ``late`` includes the overdue."""
         numbers = self.numbers
         overdue = numbers[SINK_MISSED] + numbers[SINK_OVERDUE]
-        return {
+        found: SinkVerdicts = {
             'completed': self.completed, 'late': numbers[SINK_LATE] + overdue, 'overdue': overdue,
             'expired': numbers[SINK_EXPIRED], 'failed': numbers[SINK_FAILED],
-            'dropped': numbers[SINK_DROPPED],
-            **({'aborted': numbers[SINK_ABORTED]} if numbers[SINK_ABORTED] else {}),
-            **({'demoted': numbers[SINK_DEMOTED]} if numbers[SINK_DEMOTED] else {}),
-            **({'not_due': numbers[SINK_NOT_DUE]} if numbers[SINK_NOT_DUE] else {})}
+            'dropped': numbers[SINK_DROPPED]}
+        if numbers[SINK_ABORTED]:
+            found['aborted'] = numbers[SINK_ABORTED]
+        if numbers[SINK_DEMOTED]:
+            found['demoted'] = numbers[SINK_DEMOTED]
+        if numbers[SINK_NOT_DUE]:
+            found['not_due'] = numbers[SINK_NOT_DUE]
+        return found
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> SinkCounts:
         """Return the sink's part of the result."""
-        response = None
+        response: ResponseTimes | None = None
         if self.responses:
             ordered = sorted(self.responses)
             response = {
                 'min': self.shortest, 'median': quantile(ordered, 0.5),
                 'p99': quantile(ordered, 0.99), 'max': self.longest}
-        return {'relative_deadline_ns': self.relative_deadline_ns, **self.verdicts(),
-                'response_ns': response}
+        return cast(SinkCounts, {
+            'relative_deadline_ns': self.relative_deadline_ns, **self.verdicts(),
+            'response_ns': response})
 
 
 class Tally:
@@ -211,7 +225,7 @@ class Tally:
         #: By vertex and job: the deadlines of sinks that are overdue and have no verdict yet.
         self.overdue: dict[tuple[int, int], int] = {}
         #: The miss with the earliest deadline.
-        self.first_miss: dict[str, Any] | None = None
+        self.first_miss: FirstMiss | None = None
 
     def released(self, dag: int) -> None:
         """Count the release of a job."""
@@ -275,12 +289,12 @@ class Tally:
 
     def _miss(
         self, vertex: int, job: int, deadline: int, completed: int | None
-    ) -> dict[str, Any]:
+    ) -> FirstMiss:
         dag = self._dags[self._tables.dag_of[vertex]]
         return {'dag': dag.name, 'vertex': self.vertex_name(vertex), 'job': job,
                 'deadline_ns': deadline, 'completed_ns': completed}
 
-    def _first_of_all(self) -> dict[str, Any] | None:
+    def _first_of_all(self) -> FirstMiss | None:
         """Return the miss of the earliest deadline, also of overdue sinks without verdict yet."""
         first = self.first_miss
         for (vertex, job), deadline in self.overdue.items():
@@ -311,7 +325,7 @@ class Tally:
     def _tolerate(self, vertex: int) -> WeaklyHard | None:
         return self._vertex(vertex).callback.tolerate if self._dags else None
 
-    def _sink_result(self, vertex: int) -> dict[str, Any]:
+    def _sink_result(self, vertex: int) -> SinkCounts:
         result = self.sinks[vertex].result()
         tolerate = self._tolerate(vertex)
         if tolerate is not None:
@@ -326,14 +340,15 @@ class Tally:
         """Return whether any deadline was missed."""
         return self.first_miss is not None or bool(self.overdue)
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> Verdicts:
         """Return the result format's verdicts: ``deadline_missed`` to ``dags``."""
-        dags: dict[str, Any] = {}
+        dags: dict[str, DagCounts] = {}
         for dag in self._dags:
             dags[dag.name] = {
                 'jobs': self.jobs[dag.index],
-                'ends': {OUTCOMES[e]: n for e, n in self.ends[dag.index].items()
-                         if n or e != ABORTED},
+                'ends': cast(JobEnds, {
+                    OUTCOMES[e]: n for e, n in self.ends[dag.index].items()
+                    if n or e != ABORTED}),
                 'sinks': {self.vertex_name(v): self._sink_result(v)
                           for v in self.sinks_of(dag)}}
         return {'deadline_missed': self.missed, 'first_miss': self._first_of_all(),

@@ -60,7 +60,6 @@ from mddag_executor.executor.shutdown import (
 )
 from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.statistics import statistics
-from mddag_executor.executor.statistics_types import Statistics
 from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, watched
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
@@ -68,6 +67,7 @@ from mddag_executor.executor.waitables import WaitSetThread
 from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Work
 from mddag_executor.executor.workers import WorkerPool
+from mddag_executor.results.runs import Statistics
 from msg_graph import TaskSet
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidHandle

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of an executor: a snapshot in plain dictionaries (``statistics_types``)."""
+"""Statistics of an executor: a snapshot in plain dictionaries (``results.runs``)."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from mddag_executor.core.tally import counts, never_due
 from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
-from mddag_executor.executor.statistics_types import CallbackCounts, Statistics, Stops
 from mddag_executor.executor.workers import WorkerPool
+from mddag_executor.results.runs import CallbackCounts, Statistics
 
 
 def statistics(
     pool: WorkerPool, registry: Registry, recorder: Recorder | None, process: str | None = None,
     notifier: MissNotifier | None = None,
 ) -> Statistics:
-    """Return the counts of a run; see ``statistics_types`` for their meaning."""
+    """Return the counts of a run; see ``results.runs`` for their meaning."""
     engine = pool.engine
     with pool.lock:
         result = engine.verdicts.tally.result()
-        stops = cast(Stops, engine.verdicts.stops.result())
+        stops = engine.verdicts.stops.result()
         waiting = engine.queue_length
         idle = engine.idle_workers
         undeclared = engine.undeclared

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mddag_executor.executor.statistics_types import Statistics
+from mddag_executor.results.runs import Statistics
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
 

@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
-from typing import Any
 
 from mddag_executor.laboratory.draws import Bools, Floats
 from mddag_executor.laboratory.experiment import Chunk, Experiment
+from mddag_executor.results.simulations import EvaluateResult, GraphAcceptance, PolicyAcceptance
 import numpy as np
 import numpy.typing as npt
 
@@ -71,9 +71,11 @@ class Acceptance:
             self.interval.append(wilson(good, runs) if runs else None)
         self.total = float(np.mean(accepted)) if len(accepted) else None
 
-    def result(self) -> dict[str, Any]:
+    def result(self, preemptive: bool) -> PolicyAcceptance:
         """Return the parts for machines, apart from the ratios by bin."""
-        return {'total': self.total, 'accepted': self.accepted, 'interval_95': self.interval}
+        return {
+            'preemptive': preemptive, 'total': self.total, 'accepted': self.accepted,
+            'interval_95': [None if each is None else list(each) for each in self.interval]}
 
 
 @dataclass
@@ -151,7 +153,7 @@ class Evaluation:
         bins = bins_of(self.utilisation[self.done], self.bins)
         return Acceptance(bins, accepted[self.done], len(self.bins))
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> EvaluateResult:
         """Return the result format of ``evaluate --json``."""
         experiment = self.experiment
         acceptance, bound = self.by_policy(), self.bound()
@@ -162,7 +164,7 @@ class Evaluation:
             'acceptance': {name: each.ratio for name, each in acceptance.items()},
             'bound': bound.ratio,
             'policies': {
-                name: {'preemptive': experiment.settings(name).preemptive, **each.result()}
+                name: each.result(bool(experiment.settings(name).preemptive))
                 for name, each in acceptance.items()},
             'bound_total': bound.total,
             'workers': experiment.workers, 'duration_ns': experiment.duration_ns,
@@ -171,7 +173,7 @@ class Evaluation:
             'interrupted': self.interrupted, 'compiled': self.compiled, 'jobs': self.jobs,
             'graphs': [self._graph(i) for i in range(len(self.experiments))]}
 
-    def _graph(self, index: int) -> dict[str, Any]:
+    def _graph(self, index: int) -> GraphAcceptance:
         """Return what came of one task set; the utilisation is the mean of its runs."""
         experiment = self.experiments[index]
         place = slice(index * self.runs_each, (index + 1) * self.runs_each)

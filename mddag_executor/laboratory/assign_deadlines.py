@@ -23,13 +23,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.acceptance import wilson
 from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment
 from mddag_executor.laboratory.tasks import Task, tasks_of
+from mddag_executor.results.graphs import MeasuredAcceptance
 from msg_graph import format_duration, Path, TaskSet
 from msg_graph.duration import MICROSECOND, round_up_deadline
 from msg_graph.edit import with_deadlines
@@ -56,9 +57,10 @@ class Measured(NamedTuple):
         """Return the 95 % confidence interval of the ratio."""
         return wilson(self.accepted, self.runs)
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> MeasuredAcceptance:
         """Return the parts for machines."""
-        return {**self._asdict(), 'ratio': self.ratio, 'interval_95': list(self.interval)}
+        return {'accepted': self.accepted, 'runs': self.runs, 'seed': self.seed,
+                'ratio': self.ratio, 'interval_95': list(self.interval)}
 
 
 class _Part(NamedTuple):

@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import time
-from typing import Any, NamedTuple
+from typing import Any, cast, NamedTuple
 
 from mddag_executor.report.text import format_ns, printable, table
+from mddag_executor.results.comparisons import TopResult, TopSink
 
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 GONE = 'GONE'
@@ -94,13 +95,13 @@ class Sink(NamedTuple):
                 -response / deadline if response is not None and deadline else 0.0,
                 self.sink, self.process)
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> TopSink:
         """Return the sink for JSON."""
-        return {
+        return cast(TopSink, {
             'process': self.process, 'dag': self.dag, 'sink': self.sink, 'level': self.level,
             'wrong': self.wrong, **{key: _number(self.values.get(key)) for key in (
                 'window_results', 'in_time_ratio', 'response_p99_ms', 'deadline_ms',
-                'margin_ms')}}
+                'margin_ms')}})
 
 
 def _number(text: str | None) -> float | None:
@@ -163,13 +164,14 @@ class Board:
                 level=GONE, message=f'nothing heard for {now - s.came:.0f} s')
             for _, s in sorted(self._statuses.items())]
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> TopResult:
         """Return sinks, the worst first, and statuses for JSON."""
         statuses = self.statuses()
         return {
             'sinks': [sink.result() for sink in sinks_of(statuses)],
-            'statuses': [{key: value for key, value in s._asdict().items() if key != 'came'}
-                         for s in statuses]}
+            'statuses': [
+                {'process': s.process, 'name': s.name, 'level': s.level, 'message': s.message,
+                 'values': s.values} for s in statuses]}
 
 
 def tables(statuses: list[Status], width: int | None = None) -> str:

@@ -23,16 +23,29 @@ from mddag_executor.report.tables import (
     with_means,
 )
 from mddag_executor.report.text import Cell, format_ns, printable, table
+from mddag_executor.results.comparisons import (
+    CallbackSide,
+    ComparedCallback,
+    ComparedDag,
+    ComparedRun,
+    ComparedSink,
+    DiffResult,
+    DiffResultRare,
+    SinkSide,
+    TimesChange,
+    VerdictCounts,
+)
+from mddag_executor.results.replays import CallbackUse
+from mddag_executor.results.sinks import ResponseTimes
 from mddag_executor.text import counted
 
-_KEYS = ('min', 'median', 'p99', 'max')
 _HEADER = (
     'sink', 'due A', 'due B', 'in time A', 'in time B', 'p99 A', 'p99 B', 'p99 B-A', '')
 
 
 def compare(
     before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None
-) -> dict[str, Any]:
+) -> DiffResult:
     """
     Compare the results of two replays.
 
@@ -49,23 +62,23 @@ def compare(
     every = [sink for each in (dags, requirements) for dag in each.values()
              for sink in dag['sinks'].values()]
     took: list[Mapping[str, Any]] = [side.get('callbacks', {}) for side in (before, after)]
-    callbacks = {
+    callbacks: dict[str, ComparedCallback] = {
         key: {'a': _callback(took[0].get(key)), 'b': _callback(took[1].get(key))}
         for key in _union(*took)}
+    more: DiffResultRare = {'requirements': requirements} if requirements else {}
     return {
         'a': _run(before), 'b': _run(after), 'tolerance': tolerance,
         'worse': any(sink['worse'] for sink in every),
         'compared': sum(sink['a'] is not None and sink['b'] is not None
                         and min(sink['a']['due'], sink['b']['due']) > 0 for sink in every),
-        'dags': dags, **({'requirements': requirements} if requirements else {}),
-        'callbacks': callbacks}
+        'dags': dags, **more, 'callbacks': callbacks}
 
 
 def compare_sinks(
     before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None
-) -> dict[str, Any]:
+) -> dict[str, ComparedDag]:
     """Compare the ``dags`` of two results; return those of the difference."""
-    dags: dict[str, Any] = {}
+    dags: dict[str, ComparedDag] = {}
     for name in _union(before, after):
         sides = [side.get(name, {'sinks': {}})['sinks'] for side in (before, after)]
         dags[name] = {'sinks': {
@@ -78,51 +91,68 @@ def _union(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
     return list(dict.fromkeys([*one, *other]))
 
 
-def _run(result: Mapping[str, Any]) -> dict[str, Any]:
+def _run(result: Mapping[str, Any]) -> ComparedRun:
     every = total(result['dags'])
     return {
         'trace': result['recording']['trace'], 'policy': result['policy'],
         'workers': result['workers'], 'duration_ns': result['duration_ns'],
         'utilisation': result['utilisation'], 'imported': 'recorded_callbacks' in result,
-        'rescheduled': result['rescheduled'], 'skip_ns': result['skip_ns'], **every._asdict()}
+        'rescheduled': result['rescheduled'], 'skip_ns': result['skip_ns'], **_verdicts(every)}
 
 
-def _side(sink: Mapping[str, Any] | None) -> dict[str, Any] | None:
+def _verdicts(every: Counts) -> VerdictCounts:
+    return {
+        'due': every.due, 'in_time': every.in_time, 'late': every.late, 'expired': every.expired,
+        'aborted': every.aborted, 'failed': every.failed, 'dropped': every.dropped,
+        'demoted': every.demoted, 'not_due': every.not_due}
+
+
+def _side(sink: Mapping[str, Any] | None) -> SinkSide | None:
     if sink is None:
         return None
-    return {'relative_deadline_ns': sink['relative_deadline_ns'], **counts(sink)._asdict(),
+    return {'relative_deadline_ns': sink['relative_deadline_ns'], **_verdicts(counts(sink)),
             'response_ns': sink['response_ns']}
 
 
 def _sink(
     before: Mapping[str, Any] | None, after: Mapping[str, Any] | None, tolerance: float | None
-) -> dict[str, Any]:
+) -> ComparedSink:
     a, b = _side(before), _side(after)
-    change_ns: dict[str, int] | None = None
-    change: dict[str, float | None] | None = None
+    change_ns: ResponseTimes | None = None
+    change: TimesChange | None = None
     worse = False
     if a is not None and b is not None:
         worse = (b['due'] - b['in_time']) * a['due'] > (a['due'] - a['in_time']) * b['due'] \
             or (a['due'] == 0 and b['in_time'] < b['due']) or (b['due'] == 0 and a['due'] > 0)
         if a['response_ns'] is not None and b['response_ns'] is not None:
-            change_ns = {key: b['response_ns'][key] - a['response_ns'][key] for key in _KEYS}
-            change = {key: grown / a['response_ns'][key] if a['response_ns'][key] else None
-                      for key, grown in change_ns.items()}
+            old, new = a['response_ns'], b['response_ns']
+            change_ns = {'min': new['min'] - old['min'], 'median': new['median'] - old['median'],
+                         'p99': new['p99'] - old['p99'], 'max': new['max'] - old['max']}
+            change = {
+                'min': _share(change_ns['min'], old['min']),
+                'median': _share(change_ns['median'], old['median']),
+                'p99': _share(change_ns['p99'], old['p99']),
+                'max': _share(change_ns['max'], old['max'])}
             if tolerance is not None:
                 worse |= change_ns['p99'] > tolerance * a['response_ns']['p99']
     return {'a': a, 'b': b, 'change_ns': change_ns, 'change': change, 'worse': worse}
 
 
-def _callback(use: Mapping[str, int] | None) -> dict[str, Any] | None:
+def _share(grown: int, before: int) -> float | None:
+    return grown / before if before else None
+
+
+def _callback(use: CallbackUse | None) -> CallbackSide | None:
     if use is None:
         return None
     found = with_means(use)
-    return {key: found[key] for key in ('executions', 'mean_ns', 'longest_ns', 'mean_wait_ns')}
+    return {'executions': use['executions'], 'mean_ns': found['mean_ns'],
+            'longest_ns': use['longest_ns'], 'mean_wait_ns': found['mean_wait_ns']}
 
 
 def compare_requirements(
     before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None
-) -> dict[str, Any]:
+) -> dict[str, ComparedDag]:
     """Compare the requirements of paths in two results; return them as sinks of DAGs."""
     first, second = (as_dags(side.get('requirements', {})) for side in (before, after))
     return compare_sinks(first, second, tolerance)

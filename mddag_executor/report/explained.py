@@ -10,6 +10,7 @@ from typing import Any
 from mddag_executor.analysis.causes import REMEDIES
 from mddag_executor.report.tables import percent, short_names
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
+from mddag_executor.results.replays import Stall
 from mddag_executor.text import counted
 
 MOST_STALLS = 10
@@ -44,7 +45,7 @@ def sinks_table(mostly: Sequence[Mapping[str, Any]]) -> str:
         *(names.get(each[key]) for key in ('vertex', 'behind'))] for each in mostly), grouped=1)
 
 
-def stalls_table(stalls: Sequence[Mapping[str, int]], start: int) -> str:
+def stalls_table(stalls: Sequence[Stall], start: int) -> str:
     """Return a table of the longest stalls, in order; times since the start of the run."""
     longest = sorted(stalls, key=lambda stall: -stall['length_ns'])[:MOST_STALLS]
     return table(('stop of the machine at', 'length', 'misses'), [

@@ -62,7 +62,7 @@ def times_table(
 
 
 def callbacks_table(
-    callbacks: Mapping[str, Mapping[str, int]]
+    callbacks: Mapping[str, Mapping[str, Any]]
 ) -> tuple[list[str], list[list[Cell]]]:
     """Return titles and rows of the table of callbacks, without columns that are not known."""
     short = short_names(key for key in callbacks if ':' in key)     # others are descriptions

@@ -142,7 +142,7 @@ def times(values: Mapping[str, Any] | None, *keys: str) -> list[Cell]:
             for key in keys]
 
 
-def with_means(use: Mapping[str, int]) -> dict[str, int | None]:
+def with_means(use: Mapping[str, Any]) -> dict[str, int | None]:
     """Return the usage of a callback, with ``mean_ns`` and ``mean_wait_ns`` of its executions."""
     n = use['executions']
     return {**use, 'mean_ns': use['busy_ns'] // n if n else None,

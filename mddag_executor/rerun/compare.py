@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 from mddag_executor.rerun.inputs import RecordedMessage
 from mddag_executor.rerun.message_types import type_name
 from mddag_executor.rerun.outputs import Output
+from mddag_executor.results.comparisons import TopicDifference
 from rclpy.serialization import deserialize_message
 
 CONTENT, TIMING, MISSING = 'content', 'timing', 'missing'
@@ -46,6 +47,13 @@ class Difference(NamedTuple):
     found: str
     messages: int
     expected_messages: int
+
+    def result(self) -> TopicDifference:
+        """Return its form in JSON results."""
+        return {
+            'topic': self.topic, 'kind': self.kind, 'number': self.number, 'time': self.time,
+            'field': self.field, 'expected': self.expected, 'found': self.found,
+            'messages': self.messages, 'expected_messages': self.expected_messages}
 
     def line(self) -> str:
         """Return it on one line."""

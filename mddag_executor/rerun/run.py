@@ -49,6 +49,7 @@ from mddag_executor.rerun.outputs import Output, Outputs, VirtualTraceWriter
 from mddag_executor.rerun.requests import Requests
 from mddag_executor.rerun.run_threads import Stalled
 from mddag_executor.rerun.timers import Timers
+from mddag_executor.results.comparisons import RerunResult, RerunResultRare, RerunVerdicts
 from mddag_executor.text import counted
 from msg_graph import TaskSet
 from rclpy.exceptions import ROSInterruptException
@@ -85,21 +86,28 @@ class Result:
     start_ns: int
     virtual_ns: int
     elapsed_s: float
-    verdicts: dict[str, Any]
+    verdicts: RerunVerdicts
     recorded_topics: list[str] = field(default_factory=list)
     recorded: list[Difference] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
-    def result(self) -> dict[str, Any]:
-        """Return the result format of ``rerun --json``."""
+    def result(self, differences: Sequence[Difference] | None = None) -> RerunResult:
+        """
+        Return the result format of ``rerun --json``.
+
+        :param differences: from expected outputs; None: nothing was expected.
+        """
+        more: RerunResultRare = {}
+        if differences is not None:
+            more['differences'] = [each.result() for each in differences]
         return {
             'digest': self.digest, 'messages': sum(self.counts.values()),
             'callbacks': self.callbacks, 'virtual_s': self.virtual_ns / 1e9,
             'elapsed_s': self.elapsed_s,
             'topics': dict(sorted(self.counts.items())), **self.verdicts,
             'recorded_topics': self.recorded_topics,
-            'recorded': [each._asdict() for each in self.recorded],
-            'warnings': self.warnings}
+            'recorded': [each.result() for each in self.recorded],
+            'warnings': self.warnings, **more}
 
 
 @dataclass
@@ -326,7 +334,7 @@ class Rerun:
             [each for each in outputs.messages if each.topic in both],
             recording.messages(both), loop.start)
         recording.close()
-        verdicts = {
+        verdicts: RerunVerdicts = {
             'policy': self.policy, 'workers': self._workers,
             'preemptive': False, 'duration_ns': self._passed_ns(),
             **self._engine.verdicts.tally.result()}

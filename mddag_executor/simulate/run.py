@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core.state import Decision
 from mddag_executor.errors import UsageError
+from mddag_executor.results.simulations import SimulatedRunRare, SimulatedRunResult
 from mddag_executor.simulate.engine import LogEntry
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.schedule import schedule, Settings
@@ -35,14 +35,16 @@ class SimulatedRun:
     log: Sequence[LogEntry] = ()
     decisions: Sequence[Decision] = ()
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> SimulatedRunResult:
         """Return the result format of ``simulate --json``."""
+        more: SimulatedRunRare = {}
+        if self.settings.cpus is not None:
+            more['cpus'] = self.settings.cpus
         return {
             'policy': self.settings.policy, 'on_late': self.settings.on_late,
             'workers': self.settings.workers,
             'preemptive': self.settings.preempts, 'duration_ns': self.settings.duration_ns,
-            'utilisation': self.utilisation, **self.tally.result(),
-            **({} if self.settings.cpus is None else {'cpus': self.settings.cpus})}
+            'utilisation': self.utilisation, **self.tally.result(), **more}
 
 
 def simulate(

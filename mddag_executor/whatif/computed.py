@@ -39,6 +39,7 @@ from mddag_executor.recording.columns import Table
 from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by, UNKNOWN
+from mddag_executor.results.replays import PathsResult
 from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
 from mddag_executor.simulate.load import edge_numbers, FAILS
 from mddag_executor.sources.executions import Numbering
@@ -101,7 +102,7 @@ class ComputedRun(NamedTuple):
             end=self.end, judged=self.judged, judged_until=self.end, workers_each=workers,
             judge_from=self.judge_from, judged_releases=self.judged_releases)
 
-    def requirements(self) -> dict[str, Any]:
+    def requirements(self) -> PathsResult:
         """Return ``paths`` and ``requirements`` of the result; nothing if nothing is required."""
         if not any(path.requirements for path in self.task_set.paths):
             return {}

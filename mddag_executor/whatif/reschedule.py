@@ -11,7 +11,7 @@ transport.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -24,6 +24,13 @@ from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
 from mddag_executor.recording.head import Head, ReplayError
 from mddag_executor.recording.tables import Recording, UNKNOWN
+from mddag_executor.results.replays import (
+    PathsResult,
+    RecordedRun,
+    RecordedRunRare,
+    RescheduleResult,
+    RescheduleResultRare,
+)
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.load import SKIPPED
 from mddag_executor.simulate.workload import with_execution_times
@@ -96,27 +103,29 @@ class Reschedule:
             self.task_set, self.work.load, self.log, self.decisions, end, end, True,
             self.work.jobs, self.settings.judge_from, self._run.judged_releases)
 
-    def result(self) -> dict[str, Any]:
+    def result(self) -> RescheduleResult:
         """Return the result format of ``replay --json``, including the recorded run."""
-        duration, settings, work = self.duration_ns, self.settings, self.work
-        verdicts = self.tally.result()
-        skipped = work.load.fates.count(SKIPPED)
+        settings, work, verdicts = self.settings, self.work, self.tally.result()
         miss = verdicts['first_miss']
         if miss is not None:
             dag = self.task_set.dag(miss['dag']).index
             miss = {**miss, 'job': work.jobs[dag][miss['job']]}
-        paths = self.computed().requirements() if self._requires else {}
+        cpus, processes, skips, notes = (RescheduleResultRare() for _ in range(4))
+        if settings.cpus is not None:
+            cpus['cpus'] = settings.cpus
+        if self.processes:
+            processes['processes'] = [
+                {'name': each.name, 'nodes': list(each.nodes)} for each in self.processes]
+        if skipped := work.load.fates.count(SKIPPED):
+            skips['skipped_jobs'] = skipped
+        if self.notes:
+            notes['notes'] = list(self.notes)
         return {
             'policy': settings.policy, 'on_late': settings.on_late, 'workers': self.workers,
-            'preemptive': settings.preemptive,
-            **({} if settings.cpus is None else {'cpus': settings.cpus}),
-            'duration_ns': duration,
-            **({'processes': [asdict(each) for each in self.processes]}
-               if self.processes else {}),
-            'utilisation': share(work.demand, self.workers, self._scheduled_ns),
+            'preemptive': bool(settings.preemptive), **cpus, 'duration_ns': self.duration_ns,
+            **processes, 'utilisation': share(work.demand, self.workers, self._scheduled_ns),
             **verdicts, 'first_miss': miss, 'rescheduled': True, 'skip_ns': self._skip,
-            'executions': work.executions, 'estimated_executions': work.estimated,
-            **({'skipped_jobs': skipped} if skipped else {}),
+            'executions': work.executions, 'estimated_executions': work.estimated, **skips,
             'overheads': {
                 'included': self._overheads, 'added_ns': settings.dispatch_overhead_ns,
                 'dispatch_median_ns': work.dispatch_ns,
@@ -124,14 +133,21 @@ class Reschedule:
             'worker_use': {
                 'busy_ns': {str(w): took for w, took in enumerate(self.busy)},
                 'use': share(sum(self.busy), self.workers, self._scheduled_ns)},
-            'recorded': None if self.recorded is None else {
-                'policy': self.recorded.recording.head.policy,
-                'workers': self.recorded.recording.head.workers,
-                **self.recorded.tally.result(),
-                **({'requirements': self.recorded.requirements.result()} if paths else {})},
-            **paths, 'recording': recording_result(self._run),
-            **({'notes': self.notes} if self.notes else {}),
-            'warnings': self.warnings}
+            'recorded': self._recorded_result(),
+            **(self.computed().requirements() if self._requires else PathsResult()),
+            'recording': recording_result(self._run), **notes, 'warnings': self.warnings}
+
+    def _recorded_result(self) -> RecordedRun | None:
+        """Return the verdicts about the recorded run; None: it was a bag."""
+        if self.recorded is None:
+            return None
+        more: RecordedRunRare = {}
+        if self._requires:
+            more['requirements'] = self.recorded.requirements.result()
+        return {
+            'policy': self.recorded.recording.head.policy,
+            'workers': self.recorded.recording.head.workers, **self.recorded.tally.result(),
+            **more}
 
 
 def reschedule(

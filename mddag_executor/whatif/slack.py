@@ -42,6 +42,8 @@ from mddag_executor.analysis.as_recorded import slack as margin
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.state import Decision, SINK_IN_TIME
+from mddag_executor.results.simulations import FewerResult, SlackFactor, SlackResult
+from mddag_executor.results.sinks import DagCounts
 from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
@@ -345,8 +347,8 @@ def find_slack(
 
 
 def slack_result(
-    slack: Slack, task_set: TaskSet, dags: Mapping[str, Any], processes: int = 1
-) -> dict[str, Any]:
+    slack: Slack, task_set: TaskSet, dags: Mapping[str, DagCounts], processes: int = 1
+) -> SlackResult:
     """
     Return the result format of ``slack --json``.
 
@@ -355,12 +357,16 @@ def slack_result(
     """
     names = [vertex.name for vertex in task_set.vertices]
 
-    def shown(found: Found) -> dict[str, Any]:
+    def shown(found: Found) -> SlackFactor:
         return {'factor': None if found.factor is None else round(found.factor, 4),
                 'breaks': named(found.breaks)}
 
     def named(sink: int) -> str | None:
         return None if sink == NOTHING else names[sink]
+
+    def enough(fewer: Fewer | None) -> FewerResult | None:
+        return None if fewer is None else {
+            'given': fewer.given, 'least': fewer.least, 'breaks': named(fewer.breaks)}
 
     return {
         'most': MOST,
@@ -368,8 +374,7 @@ def slack_result(
         'callbacks': {callback.key: shown(slack.factors[i])
                       for i, callback in enumerate(task_set.callbacks) if i in slack.factors},
         'load': shown(slack.factors[ALL]),
-        **{of: None if fewer is None else {**fewer._asdict(), 'breaks': named(fewer.breaks)}
-           for of, fewer in slack.fewer.items()},
+        'workers': enough(slack.fewer['workers']), 'cpus': enough(slack.fewer['cpus']),
         'missed': {names[sink]: slack.missed[sink] for sink in sorted(slack.missed)},
         'left_out': [names[sink] for sink in slack.left_out],
         'sinks': {name: {'relative_deadline_ns': sink['relative_deadline_ns'],

@@ -5,8 +5,7 @@
 import itertools
 import os
 import time
-from types import NoneType, SimpleNamespace, UnionType
-from typing import get_args, get_origin, get_type_hints, is_typeddict, Union
+from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mddag_executor import open_recording
@@ -17,10 +16,10 @@ from mddag_executor.core.state import SINK_EXPIRED, SINK_IN_TIME, SINK_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.executor.diagnostics import DagWatch, ERROR, OK, RequirementWatch, STALE, WARN
 from mddag_executor.executor.settings import Thresholds
-from mddag_executor.executor.statistics_types import Statistics
 from mddag_executor.executor.watch import Watch
 from mddag_executor.report.board import Board
 from mddag_executor.report.live_runs import live_lines
+from mddag_executor.results.runs import Statistics
 from msg_graph import loads, Path
 import pytest
 from rclpy.executors import ExternalShutdownException
@@ -28,6 +27,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_msgs.msg import Empty, String
 
+from ..json_results import errors_of
 from .conftest import Spinning, wait_for
 from .declared import CHAIN, Declared, graph
 
@@ -179,29 +179,6 @@ def test_a_shutdown_of_the_context_ends_it_quietly(make_executor, make_node, ros
 # --- statistics ----------------------------------------------------------------------------------
 
 
-def check(value, hint, place):
-    """Find out whether a value has the type that is declared, no key missing or more."""
-    if is_typeddict(hint):
-        hints = get_type_hints(hint)
-        assert isinstance(value, dict), place
-        assert hint.__required_keys__ <= set(value) <= set(hints), place
-        for key, inner in value.items():
-            check(inner, hints[key], f'{place}.{key}')
-    elif get_origin(hint) in (Union, UnionType):
-        kinds = [each for each in get_args(hint) if each is not NoneType]
-        if value is not None:
-            check(value, kinds[0], place)
-    elif get_origin(hint) is dict:
-        for key, inner in value.items():
-            assert isinstance(key, str), place
-            check(inner, get_args(hint)[1], f'{place}[{key}]')
-    elif get_origin(hint) is list:
-        for inner in value:
-            check(inner, get_args(hint)[0], place)
-    else:
-        assert isinstance(value, hint), f'{place}: {value!r}'
-
-
 def test_statistics_have_the_declared_types(make_executor, make_node, tmp_path):
     trace = tmp_path / 'run.mcap'
     node = make_node('n')
@@ -212,12 +189,12 @@ mddag: 1
 nodes:
   - {node: /n, callbacks: [{name: t, timer: 20ms, deadline: 1us}]}
 """), trace=trace, worker_cpus=list(os.sched_getaffinity(0)))
-    check(executor.statistics(), Statistics, 'statistics')
+    assert errors_of(executor.statistics(), (Statistics,)) == []
     executor.add_node(node)
     with executor as entered, Spinning(entered):
         assert wait_for(lambda: executor.statistics()['dags']['/n']['ends']['late'] > 0)
     found = executor.statistics()
-    check(found, Statistics, 'statistics')
+    assert errors_of(found, (Statistics,)) == []
     assert found['trace'] == {'path': str(trace), 'lost': 0, 'error': None}
     assert found['first_miss'] is not None
     assert found['dags']['/n']['sinks']['/n:t']['response_ns'] is not None
