@@ -28,6 +28,14 @@ GUARD_PART = 25
 NET_NS = 20_000_000
 """While a short callback runs longer than expected, arrivals stay unnoticed for this at most."""
 
+QUIET_NS = 5_000_000
+"""
+If no thread had nothing to run for this long, one that rests ends the next look.
+
+In a process with few callbacks this costs less than the look; with many, the look is put off by
+the next callback anyway.
+"""
+
 LOOK_PART = 4
 """
 While callbacks compute, a timer or message may stay unnoticed for this part of its deadline.

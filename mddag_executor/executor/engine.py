@@ -19,8 +19,10 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     queue's (``core.queues``), so a queue that overflows permanently gets its turn.
     Messages of the other topics of a driven sync belong to no job.  The execution that they start
     may complete the vertex of one (``core.driven``): ``Work.answers``.
-3.  *The core decides* what to run (``dispatch``), and handles the ends of executions
-    (``finished``, ``suspended``, ``refused``, …): see ``core.rules``.
+3.  *The core decides* what to run, and handles the ends of executions (``finished``,
+    ``suspended``, ``refused``, …): see ``core.rules``.  After all events of a turn are reported,
+    ``step`` returns instructions: what to run, whether another thread may start something, and
+    when to look again.  What else is read from outside is ``interpreter``.
 4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
     undeclared callbacks run one after the other, in the order in which they became ready, and the
     core does not know of them.  It would choose the same.  As soon as there is anything else to
@@ -47,8 +49,6 @@ from mddag_executor.core.overload import admit, is_late
 from mddag_executor.core.queues import (
     first_of,
     has_place,
-    overtaking_pays,
-    overtaking_pays_from,
 )
 from mddag_executor.core.state import (
     ALONE,
@@ -62,14 +62,15 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
-from mddag_executor.executor.bounds import GUARD_NS, GUARD_PART, MOST, SHORT_CALLBACK_NS
+from mddag_executor.executor.bounds import NET_NS, SHORT_CALLBACK_NS
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.interpreter import has_waiting, Interpreter
 from mddag_executor.executor.jobs import Announced, header_stamp, Jobs, NO_ORIGIN, Origin
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
-from mddag_executor.trace.groups import EXECUTION
+from mddag_executor.trace.groups import EXECUTION, PUBLICATION
 from mddag_executor.trace.schema import GOES_ON
 from msg_graph import TaskSet
 from msg_graph.model import optional_edges
@@ -79,6 +80,33 @@ if TYPE_CHECKING:
 
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most this many releases are judged one by one."""
+
+
+class Step:
+    """
+    What the threads are to do, as the engine answers; valid until the next call of the engine.
+
+    :ivar work: the execution to run; None: there is none.
+    :ivar is_short: whether it usually ends soon.
+    :ivar overtaken: the execution that is to pause while it runs; None: none.
+    :ivar holder: the execution that holds the interpreter and computes; None: none.
+    :ivar more: whether another thread may start an execution now.
+    :ivar n_idle: how many workers run nothing.
+    :ivar patience_ns: how long what waits, or may come, may wait for a short execution to end.
+    :ivar deadline: a time at or before the next deadline of an open job, ns on the trace's clock.
+    """
+
+    __slots__ = ('work', 'is_short', 'overtaken', 'holder', 'more', 'n_idle', 'patience_ns',
+                 'deadline')
+
+    def __init__(self) -> None:
+        self.work: Work | None = None
+        self.overtaken: Work | None = None
+        self.holder: Work | None = None
+        self.is_short = self.more = False
+        self.n_idle = 0
+        self.patience_ns = NET_NS
+        self.deadline = NEVER
 
 
 class Engine:
@@ -150,12 +178,13 @@ class Engine:
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
         self._ended = NEVER
-        #: whether a callback pauses while a more urgent one overtakes it
-        self.pauses = False
-        # executions that hold the GIL, in the order in which they began; read-only outside
-        self.holders: list[Work] = []
+        self.interpreter = Interpreter(self.tables, self._state)
+        self._holders = self.interpreter.holders
+        self._step = Step()
         urgency = self.scheduler.policy.urgency
         self._keys_are_times = urgency != OTHER_KEYS
+        #: whether ``publishes`` is to be called
+        self.notes_publications = record is not None or self.path_watch is not None
         self._default_deadline = default_deadline
 
     # --- ready work --- --------------------------------------------------------------------------
@@ -312,7 +341,7 @@ class Engine:
     def _is_core_empty(self) -> bool:
         """Return whether nothing is waiting, running on a worker or owning a group in the core."""
         state = self._state
-        return not (self._core_has_waiting() or state.scalars[N_IDLE] < self.n_workers
+        return not (has_waiting(self._state) or state.scalars[N_IDLE] < self.n_workers
                     or max(state.group_owner, default=-1) >= 0)
 
     def _core(self) -> Scheduler:
@@ -458,39 +487,86 @@ class Engine:
     # --- dispatch --- ----------------------------------------------------------------------------
 
     @property
-    def has_waiting(self) -> bool:
-        """Return whether any execution waits, except for its callback group."""
-        return bool(self._lane) or not self._is_bypassed and self._core_has_waiting()
-
-    def _core_has_waiting(self) -> bool:
-        state = self._state
-        return bool(state.ready or state.held_back or state.unpolled)
-
-    @property
     def queue_length(self) -> int:
         """Return the number of executions that wait, for a worker or for their group."""
         return len(self._lane) + self.scheduler.queue_length
-
-    def patience(self) -> int:
-        """Return how long what is ready may wait for a callback that was expected to end, ns."""
-        ready = self._state.ready
-        vertex = self.tables.n_vertices
-        if ready:
-            vertex = self._state.x_vertex[first_of(self._state, ready[0])]
-        return min(GUARD_NS, max(
-            2 * SHORT_CALLBACK_NS, self.tables.rad_offset[vertex] // GUARD_PART))
 
     @property
     def idle_workers(self) -> int:
         """Return the number of workers that run nothing."""
         return self._state.scalars[N_IDLE] - (self._bypassing is not None)
 
-    def dispatch(self, worker: int, now: int) -> Work | None:
+    @property
+    def is_busy(self) -> bool:
+        """Return whether any execution runs on a worker."""
+        return self.idle_workers < self.n_workers
+
+    @property
+    def has_waiting(self) -> bool:
+        """Return whether any execution waits, except for its callback group."""
+        return bool(self._lane) or has_waiting(self._state)
+
+    def step(self, worker: int, now: int, others_wait: bool = True) -> Step:
         """
-        Dispatch the next execution on a worker that runs nothing; None: nothing may start.
+        Choose the next execution for a worker that runs nothing, after all events up to now.
 
         :param worker: the worker to use if it is idle; else the lowest idle one is used.
+        :param others_wait: whether a thread waits for events, which can start more at once.
         """
+        step, state, holders = self._step, self._state, self._holders
+        step.overtaken = None
+        step.deadline = self.deadlines.next
+        if self._lane or state.ready or state.held_back or state.unpolled:
+            work = step.work = self._dispatch(worker, now)
+            waits = bool(self._lane or state.ready or state.held_back or state.unpolled)
+        else:
+            work = step.work = None
+            waits = False
+        if work is None:
+            step.is_short = False
+            if step.deadline < NEVER:
+                step.deadline = self.deadlines.first()
+        else:
+            step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
+        if holders:
+            holder = step.holder = holders[-1]
+            if holder is work and len(holders) > 1 and self.interpreter.pauses:
+                step.overtaken = holders[-2]
+        else:
+            step.holder = None
+        step.n_idle = state.scalars[N_IDLE]
+        if self._bypassing is not None:
+            step.n_idle -= 1
+        if waits:
+            self._advise(step, now, others_wait or not step.is_short)
+        else:
+            step.more = False
+            step.patience_ns = NET_NS
+        return step
+
+    def look(self, now: int, asks: bool = True) -> Step:
+        """
+        Return what other threads are to do, after all events up to now.
+
+        :param asks: whether one of them can start ``more``.
+        """
+        step = self._step
+        step.work = step.overtaken = None
+        step.is_short = step.more = False
+        step.holder = self._holders[-1] if self._holders else None
+        step.deadline = self.deadlines.next
+        step.n_idle = self.idle_workers
+        step.patience_ns = NET_NS
+        if self.has_waiting:
+            self._advise(step, now, asks)
+        return step
+
+    def _advise(self, step: Step, now: int, asks: bool) -> None:
+        """Set what a step says about other threads, as something waits."""
+        step.patience_ns = self.interpreter.patience()
+        step.more = asks and self._may_start_more(now)
+
+    def _dispatch(self, worker: int, now: int) -> Work | None:
         work = None
         if self._is_bypassed:
             if not self._lane:
@@ -513,8 +589,8 @@ class Engine:
                 if not state.scalars[N_IDLE]:
                     return None
                 worker = state.worker_x.index(-1)
-            if self.holders:
-                state.overtaking[1] = self._may_be_overtaken(now)
+            if self._holders:
+                state.overtaking[1] = self.interpreter.may_be_overtaken(now)
             work = self._start_next(worker, now)
             if work is None:
                 return None
@@ -539,7 +615,7 @@ class Engine:
         if work.entity.awaiting is not None and work.answers is None:
             self._begin_driven(work, work.entity.awaiting)
         if state.x_holds[x]:
-            self.holders.append(work)
+            self._holders.append(work)
         if self.path_watch is not None:
             begun = work.origin or work.answers
             if begun is not None:
@@ -594,66 +670,18 @@ class Engine:
                 rad_offset[vertex] for vertex, _ in entity.targets.values()), default=0)
         return deadline // 2  # its job was released before it arrived
 
-    def may_start_more(self, now: int) -> bool:
-        """Return whether an idle worker may be able to start an execution; True if in doubt."""
+    def _may_start_more(self, now: int) -> bool:
         if self._is_bypassed:
             if self._bypassing is None or not self._lane:
                 return bool(self._lane)
             self._core()
-        state = self._state
-        if not state.scalars[N_IDLE] or not self._core_has_waiting():
-            return False
-        ready, held_back = state.ready, state.held_back
-        is_held = bool(self.holders)
-        if state.unpolled or len(ready) > MOST or held_back and not is_held:
-            return True
-        x_holds, x_group, owners = state.x_holds, state.x_group, state.group_owner
-        has_outer = bool(state.outer_limit)
-        first = held_back[0] if held_back else None
-        for entry in ready:
-            x = first_of(state, entry)
-            group = x_group[x]
-            if group >= 0 and owners[group] >= 0 and owners[group] != x:
-                continue
-            if has_outer and not has_place(state, x):
-                continue
-            if not is_held or not x_holds[x]:
-                return True
-            if first is None or entry < first:
-                first = entry
-        return (first is not None and first[0] < state.x_key[self.holders[-1].x][0]
-                and bool(self._may_be_overtaken(now)))
+        return self.interpreter.may_start_more(now)
 
-    # --- the GIL ---------------------------------------------------------------------------------
-
-    def _may_be_overtaken(self, now: int) -> bool:
-        """Return whether the first waiting execution may overtake the latest holder of the GIL."""
-        work = self.holders[-1]
-        return overtaking_pays(
-            self.tables, self._state, 1, now - self._held_from(work),
-            work.entity.habit.mean_ns, self.pauses)
-
-    def overtaking_at(self) -> int:
-        """Return when the first waiting execution may overtake the latest holder of the GIL."""
-        work = self.holders[-1]
-        return self._held_from(work) + overtaking_pays_from(
-            self.tables, self._state, 1, work.entity.habit.mean_ns, self.pauses)
-
-    def interpreter_holder(self) -> Work | None:
-        """Return the most urgent execution that holds the interpreter: the latest to overtake."""
-        return self.holders[-1] if self.holders else None
-
-    def usual_end(self, work: Work) -> int:
-        """Return until when a running execution computes if it takes twice as long as usual."""
-        return self._held_from(work) + 2 * work.entity.habit.mean_ns
-
-    def _held_from(self, work: Work) -> int:
-        """Return when an execution would have started to hold the interpreter without pauses."""
-        return self._state.x_started[work.x] + work.paused_ns
+    # --- executions that run ---------------------------------------------------------------------
 
     def _let_go(self, work: Work) -> None:
-        if work in self.holders:
-            self.holders.remove(work)
+        if work in self._holders:
+            self._holders.remove(work)
 
     def stop_holding(self, work: Work) -> None:
         """Release the interpreter for an execution that does not need it now."""
@@ -679,11 +707,17 @@ class Engine:
         """Return whether an execution that is to go on waits for others of its outer group."""
         return not has_place(self._state, work.x)
 
-    def rejoin(self, work: Work, now: int) -> None:
-        """Make an execution that has lent its worker ready to go on: ``dispatch`` returns it."""
+    def rejoin(self, work: Work, now: int) -> bool:
+        """
+        Make an execution that has lent its worker ready to go on: ``step`` returns it.
+
+        :return: whether nothing else waited.
+        """
         entity = work.entity
+        is_first = not self.has_waiting
         self._work[work.x] = work
         self._core().rejoin(work.x, entity.ready, entity.habit.holds, now)
+        return is_first
 
     def go_on_without(self, work: Work) -> None:
         """Let an execution go on that waits for a worker after ``rejoin``, without one."""
@@ -951,6 +985,22 @@ class Engine:
                     and work.origin is not None):
                 self._record_dispatch(work, now, get_native_id(), -1)
 
+    def publishes(
+        self, work: Work | None, topic: str, address: int, message: Any, now: int, vtid: int
+    ) -> None:
+        """Note that a callback publishes, while ``notes_publications``; without the lock."""
+        if self.record is not None:
+            self.record(
+                PUBLICATION, now, vtid, address, id(message), max(0, header_stamp(message)))
+        if work is not None and self.path_watch is not None and topic in self.path_watch.topics:
+            work.sent += (topic, now),
+
+    def job_of(self, work: Work) -> tuple[str, int, int] | None:
+        """Return DAG, index and release of the job of a running execution; None: no job."""
+        origin = work.origin
+        return None if origin is None else (
+            self.dag_names[origin.dag], origin.job, self.release_of(work))
+
     def release_of(self, work: Work) -> int:
         """Return the release of the job of a declared execution; the job must not have ended."""
         assert work.origin is not None
@@ -985,9 +1035,9 @@ class Engine:
         return {} if self.path_watch is None else self.path_watch.result(
             min(now, self._ended), self._state.scalars[JUDGE_FROM])
 
-    def next_deadline(self) -> int:
-        """Return a time at or before the next deadline of an open job; NEVER: there is none."""
-        return self.deadlines.first()
+    def stopped(self, begin: int, end: int) -> None:
+        """Note that the machine stood still; with equal times: that it has not so far."""
+        self.verdicts.stopped(begin, end)
 
     def judge_overdue(self, now: int) -> None:
         """Report the sinks whose deadlines are over and which have not completed."""
@@ -1033,10 +1083,10 @@ class Engine:
         if len(self._work) != sum(map(state.x_state.count, (WAITING, ALONE, SUSPENDED))):
             yield f'of what waits or is suspended, work is known of {sorted(self._work)} only'
         holding = sorted(x for x in state.worker_x if x >= 0 and state.x_holds[x])
-        if sorted(work.x for work in self.holders) != holding:
-            yield f'executions {holding} hold the GIL, noted are {[w.x for w in self.holders]}'
+        if sorted(work.x for work in self._holders) != holding:
+            yield f'executions {holding} hold the GIL, noted are {[w.x for w in self._holders]}'
             return
-        keys = [state.x_key[work.x][0] for work in self.holders]
+        keys = [state.x_key[work.x][0] for work in self._holders]
         if any(after >= before for before, after in zip(keys, keys[1:])):
             yield f'the GIL was overtaken by something that is not more urgent: {keys}'
 

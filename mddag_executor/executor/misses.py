@@ -139,8 +139,16 @@ class MissLog:
 
     def is_behind(self) -> bool:
         """Return whether there were misses since the last line, and a line may be logged."""
-        return self._verdicts.missed != self._logged and (
+        return self.has_new() and (
             not self._logged or time.monotonic() - self._at >= LOG_EVERY_S)
+
+    def has_new(self) -> bool:
+        """Return whether there were misses since the last line."""
+        return self._verdicts.missed != self._logged
+
+    def next_at(self) -> int:
+        """Return when the next line may be logged, monotonic ns."""
+        return int((self._at + LOG_EVERY_S) * 1e9)
 
     def write(self) -> None:
         """Log the misses since the last line, if any; from any thread, without a lock."""

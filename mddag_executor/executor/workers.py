@@ -66,11 +66,11 @@ from mddag_executor.executor.bounds import (
 from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN, QuickCallback
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.due import DueTimes
-from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.engine import Engine, Step
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.hall import Announced, Spinner
-from mddag_executor.executor.jobs import header_stamp, PublisherState
+from mddag_executor.executor.jobs import PublisherState
 from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.pausing import can_pause, Pause
@@ -78,7 +78,6 @@ from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import Fired, TimerQueue
 from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Destroyed, Refused, Work
-from mddag_executor.trace.groups import PUBLICATION
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
@@ -193,17 +192,9 @@ class WorkerThread:
 
     def publishes(self, state: PublisherState, msg: Any) -> None:
         """Note that the running callback publishes."""
-        topic = state.topic
-        record, work = self.engine.record, self.work
-        watch = self.engine.path_watch
-        is_watched = watch is not None and topic in watch.topics
-        if record is not None or is_watched:
-            now = self.pool.clock.now()
-            if record is not None:
-                record(PUBLICATION, now, self.vtid, state.address, id(msg),
-                       max(0, header_stamp(msg)))
-            if is_watched and work is not None:
-                work.sent += (topic, now),
+        topic, work, engine = state.topic, self.work, self.engine
+        if engine.notes_publications:
+            engine.publishes(work, topic, state.address, msg, self.pool.clock.now(), self.vtid)
         if work is not None and topic not in work.entity.publishes:
             work.entity.publishes.add(topic)
         if not self.published:
@@ -223,11 +214,7 @@ class WorkerThread:
     @property
     def job(self) -> tuple[str, int, int] | None:
         """Return DAG, index and release of the job whose callback runs; None: no job."""
-        work = self.work
-        if work is None or work.origin is None:
-            return None
-        return (self.engine.dag_names[work.origin.dag], work.origin.job,
-                self.engine.release_of(work))
+        return None if self.work is None else self.engine.job_of(self.work)
 
 
 class WorkerPool:
@@ -249,12 +236,13 @@ class WorkerPool:
     ) -> None:
         self.engine = engine
         engine.allow_bypass()
+        self._is_recorded = engine.record is not None
         self.clock = clock
         self._offset = clock.offset_ns
         # reentrant only to know its owner: a signal handler may run inside
         self.lock = engine_lock(self._validate, engine.size)
         # the last changes of threads: time, name, and new state
-        self._history: deque[tuple[int, str, ThreadState]] = deque(maxlen=HISTORY)
+        self._history = deque([(0, '', _PARKED)] * HISTORY, HISTORY)
         #: functions to call when the calling thread does not own the lock
         self.deferred: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
@@ -267,7 +255,7 @@ class WorkerPool:
         self.is_current = False
         # those that are overtaken, by their executions
         self._pauses: dict[Work, Pause] = {}
-        engine.pauses = can_pause()
+        engine.interpreter.pauses = can_pause()
         self.lent = 0
         # the threads of executions that have lent their workers, and wait to go on
         self._rejoining: dict[Work, WorkerThread] = {}
@@ -283,7 +271,11 @@ class WorkerPool:
         self.wake_executor: Callable[[], None] = _nothing
         self._executor: Callable[[], Spinner | None] = _nothing
         self.fail = fail
+        self._verdicts = engine.verdicts
         self._miss_log = MissLog(engine.verdicts)
+        # how many misses were noted; whether a line is to be logged later
+        self._misses = 0
+        self._logs_later = False
         self._prepare_thread = prepare_thread
         self._threads: list[WorkerThread] = []
         self._visitors: list[WorkerThread] = []
@@ -392,17 +384,23 @@ class WorkerPool:
         """Wake a thread if an idle worker may start an execution; the caller holds the lock."""
         if not self.running:
             return
-        engine, running = self.engine, current.running
+        running = current.running
         if running is not None and running.pool is self and running.is_short():
-            if engine.idle_workers:
-                rest = engine.patience()
+            step = self.engine.look(self.now, asks=False)
+            if step.n_idle:
+                rest = step.patience_ns
                 # if something computes, it is not known yet whether it does
                 self.due.arm_by(
-                    monotonic_ns() + (rest // 2 if engine.holders else rest))
-        elif engine.may_start_more(self.now):
+                    monotonic_ns() + (rest // 2 if step.holder is not None else rest))
+        else:
+            self._wake_for(self.engine.look(self.now), self.now)
+
+    def _wake_for(self, step: Step, now: int) -> None:
+        """Wake a thread if it may start an execution, or check what that has to wait for."""
+        if step.more:
             self._call()
-        elif engine.holders and engine.idle_workers and engine.has_waiting:
-            self.due.check_holder(monotonic_ns())
+        elif step.n_idle and step.holder is not None and self.engine.interpreter.is_wanted():
+            self.due.check.begin(now - self._offset)
 
     def _call(self) -> None:
         """Wake a thread, which starts what may start, or waits for events."""
@@ -417,10 +415,6 @@ class WorkerPool:
     def has_idle_threads(self) -> bool:
         """Return whether any thread waits for events, or may look for them."""
         return bool(self.polling or self._n_parked)
-
-    def is_busy(self) -> bool:
-        """Return whether any execution runs on a worker."""
-        return self.engine.idle_workers < self.engine.n_workers
 
     def note_eager(self, entity: Entity) -> None:
         """Note whether a thread must wait for an entity's messages or requests, at any time."""
@@ -449,7 +443,7 @@ class WorkerPool:
             self.is_stepping = False
             self.stopped_at = 0
             self.due.begin(self.tick() - self._offset)
-            self.engine.verdicts.stopped(self.now, self.now)  # stops are noticed from now on
+            self.engine.stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:
                 self._new_thread()
             # one that did not leave after the last spin (``pause``) is asleep, and not parked
@@ -607,7 +601,7 @@ class WorkerPool:
 
     def _story(self) -> list[str]:
         return [f'{(at - self.now) / 1e6:+.3f} ms {name} {state.value}'
-                for at, name, state in self._history]
+                for at, name, state in self._history if name]
 
     def _become(self, me: WorkerThread, state: ThreadState) -> None:
         """Change the state of a thread; the caller holds the lock."""
@@ -682,8 +676,8 @@ class WorkerPool:
         if self.running and not self.polling:
             self._polled_at = now
             self._collect(self.loop.poll(), now)
-            if self.engine.has_waiting:
-                self.due.check_late(self.now)
+            if self.engine.interpreter.is_wanted():
+                self.due.check.begin_late(now - self._offset)
 
     def _go_on(self, me: WorkerThread, is_last: bool = False) -> bool:
         """
@@ -713,7 +707,8 @@ class WorkerPool:
                     self._look(now)
             if is_last:
                 self.due.arm(now - self._offset)
-                self.log_misses()
+                if self._verdicts.missed != self._misses:
+                    self._note_misses()
             found = not is_last and self._choose(me, self.now)
             if self._pauses:
                 self.end_pauses()
@@ -721,10 +716,21 @@ class WorkerPool:
             self._do_deferred()
         return found
 
-    def log_misses(self) -> None:
-        """Let misses be logged when the lock is free, if there were new ones."""
+    def _note_misses(self) -> None:
+        """Let new misses be logged when the lock is free, or when the next line may follow."""
+        self._misses = self._verdicts.missed
         if self._miss_log.is_behind():
-            self.deferred.append(self._miss_log.write)
+            self.deferred.append(self._log_misses)
+        elif not self._logs_later:
+            self._logs_later = True
+            self.due.call_at(self._miss_log.next_at(), self._log_misses)
+
+    def _log_misses(self) -> None:
+        self._miss_log.write()
+        with self.lock:
+            self._logs_later = False
+            if self._miss_log.has_new():
+                self._note_misses()
 
     def waited_since(self, mine: int) -> int:
         """
@@ -752,55 +758,53 @@ class WorkerPool:
         engine = self.engine
         due = self.due
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
-        may_run = self.running and not (self.is_stepping and me.thread is not None)
-        work: Any = engine.dispatch(me.worker, now) if may_run else None
-        while work in self._rejoining:
-            self._hand_over(work, now)
-            work = engine.dispatch(me.worker, now)
+        if self.running and not (self.is_stepping and me.thread is not None):
+            step = engine.step(me.worker, now, self.polling > 0)
+            while step.work in self._rejoining:
+                self._hand_over(step, now)
+                step = engine.step(me.worker, now, self.polling > 0)
+        else:
+            step = engine.look(now, self.is_stepping)
+        if step.deadline != due.overdue.deadline:
+            due.overdue.set(step.deadline)
+        work = step.work
         if work is None:
-            self.log_misses()
+            if self._verdicts.missed != self._misses:
+                self._note_misses()
             if me.thread is not None:  # else a visitor: the thread of a spin_once
-                self._rest(me)
-                if self.is_stepping and engine.may_start_more(now):
+                self._rest(me, step)
+                if self.is_stepping and step.more:
                     self._call()
-            due.arm(now - self._offset)
+            due.rest(now - self._offset)
             return False
         me.work = work
         me.worker = work.worker
-        self._become(me, ThreadState.RUNNING)
-        is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
-        computes = bool(engine.holders) and engine.holders[-1] is work
-        self._pause_for(work, me)
-        me.is_spare = not (is_short or computes)
+        self._become(me, _RUNNING)
+        if step.overtaken is not None:
+            self._pause(step.overtaken, me)
+        me.is_spare = not (step.is_short or step.holder is work)
         if self.is_stepping:
             due.arm(now - self._offset)
         elif self.polling:
-            if engine.may_start_more(now):
+            if step.more:
                 self._call()
-            else:
-                due.note_deadline()
-                if self.agenda.first() < self.loop.timer.at:
-                    due.arm(now - self._offset)
-        elif engine.idle_workers:
-            if is_short:
-                due.look_after(now - self._offset)
-            elif me.is_spare or self._eager or engine.may_start_more(now):
+            elif self.agenda.first() < self.loop.timer.at:
+                due.arm(now - self._offset)
+        elif step.n_idle:
+            if step.is_short:
+                due.look_after(now - self._offset, step.patience_ns)
+            elif me.is_spare or self._eager or step.more:
                 self._call()
             else:
                 due.look(now - self._offset)
         return True
 
-    def _pause_for(self, work: Work, me: WorkerThread) -> None:
+    def _pause(self, overtaken: Work, me: WorkerThread) -> None:
         """Let the callback pause that an execution overtakes; the caller holds the lock."""
-        holders = self.engine.holders
-        if len(holders) < 2 or holders[-1] is not work or not self.engine.pauses:
-            return
-        overtaken = holders[-2]
         thread = self.thread_of(overtaken)
-        if thread is None:
-            return
-        if overtaken not in self._pauses:  # else the last one that overtook it has just ended
+        if thread is not None and overtaken not in self._pauses:
             me.pause = self._pauses[overtaken] = Pause(thread)
+        # else the last one that overtook it has just ended
 
     @property
     def is_watched(self) -> bool:
@@ -810,35 +814,34 @@ class WorkerPool:
     def overtaker(self) -> tuple[Work | None, WorkerThread | None]:
         """Return the execution that holds the GIL, and its thread."""
         with self.lock:
-            holder = self.engine.interpreter_holder()
+            holder = self.engine.interpreter.holder
             return holder, None if holder is None else self.thread_of(holder)
 
     def overtaker_waits(self, urgent: Work) -> None:
         """Take the GIL from an execution that does not compute."""
         with self.lock:
             self.tick()
-            if self.engine.interpreter_holder() is urgent:
+            if self.engine.interpreter.holder is urgent:
                 self.engine.stop_holding(urgent)
                 self.end_pauses()
                 self.wake_for_more()
 
     def end_pauses(self) -> None:
         """Let those go on that are overtaken no more; the caller holds the lock."""
-        overtaken = self.engine.holders[:-1]
+        overtaken = self.engine.interpreter.overtaken
         for work in [each for each in self._pauses if each not in overtaken]:
             pause = self._pauses.pop(work)
             work.paused_ns += self.now - self._offset - pause.since
             pause.end()
 
-    def _rest(self, me: WorkerThread) -> None:
+    def _rest(self, me: WorkerThread, step: Step) -> None:
         """Let a thread without an execution wait for events, or park it."""
-        engine = self.engine
-        others = self.polling - (me.state is ThreadState.WAITING)
+        others = self.polling - (me.state is _WAITING)
         # while a callback computes, its thread handles the events when it ends
         waits = self.running and not self.is_stepping and not self._closed and (
-            self._eager > 0 or not engine.holders) and (
-            others == 0 or me.is_spare and others < engine.idle_workers)
-        self._become(me, ThreadState.WAITING if waits else ThreadState.PARKED)
+            self._eager > 0 or step.holder is None) and (
+            others == 0 or me.is_spare and others < step.n_idle)
+        self._become(me, _WAITING if waits else _PARKED)
 
     def thread_of(self, work: Work) -> WorkerThread | None:
         """Return the thread that runs an execution."""
@@ -855,7 +858,7 @@ class WorkerPool:
         must_check = not self.is_current or (
             entity.may_be_gone and work.ready_ns != self.now)  # else it was just checked
         measurement = None
-        if habit.rests < 1 or self.engine.record is not None:
+        if habit.rests < 1 or self._is_recorded:
             measurement = Measurement(habit)
         me.measurement = measurement
         me.published = me.paused_ns = 0
@@ -1007,19 +1010,16 @@ class WorkerPool:
             now = self.tick()
             if not self.running:
                 return
-            is_first = not engine.has_waiting
-            engine.rejoin(work, now)
+            is_first = engine.rejoin(work, now)
             self._rejoining[work] = me
             # what waits already is chosen by another thread, as this one cannot run it
-            first = engine.dispatch(me.worker, now) if is_first else None
-            if first is not None:
-                self._hand_over(first, now)
-            if not self.polling:
+            step = engine.step(me.worker, now) if is_first else engine.look(now)
+            if step.work is not None:
+                self._hand_over(step, now)
+            if self.polling:
+                self._wake_for(step, now)
+            else:
                 self._call()
-            elif engine.may_start_more(now):
-                self._call()
-            elif engine.holders and engine.idle_workers:
-                self.due.check_holder(now - self._offset)
             seen = self._n_ended, process_time_ns()
         while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
             with self.lock:
@@ -1032,17 +1032,19 @@ class WorkerPool:
                     self._go_on_without(work)
         me.wait_for_pause()
 
-    def _hand_over(self, work: Work, now: int) -> None:
+    def _hand_over(self, step: Step, now: int) -> None:
         """Let an execution go on that was dispatched again; the caller holds the lock."""
+        work: Any = step.work
         thread = self._rejoining.pop(work)
         self._become(thread, ThreadState.RUNNING)
         thread.worker = work.worker
         thread.is_out = False
         self._waiting_calls -= 1
-        self._pause_for(work, thread)
+        if step.overtaken is not None:
+            self._pause(step.overtaken, thread)
         thread.permit.release()
-        if self.engine.holders and self.engine.has_waiting:
-            self.due.check_holder(now - self._offset)
+        if self.engine.interpreter.is_wanted():
+            self.due.check.begin(now - self._offset)
 
     def _go_on_without(self, work: Work) -> None:
         """Let an execution go on without a worker; the caller holds the lock."""
@@ -1121,5 +1123,4 @@ class WorkerPool:
 
     def is_idle(self) -> bool:
         """Return whether no execution runs or is ready."""
-        return not self.engine.has_waiting and (
-            self.engine.idle_workers >= self.engine.n_workers)
+        return not (self.engine.has_waiting or self.engine.is_busy)

@@ -206,7 +206,7 @@ class Loop:
             function(*args)
             return True
         engine = self.engine
-        work = engine.dispatch(0, now)
+        work = engine.step(0, now).work
         if work is not None:
             self._execute(work)
             return True
@@ -243,7 +243,7 @@ class Loop:
             self.now + 1, min(self._machine.scalars[NEXT_TIME], *self._finish_at))
         if self._events:
             next_at = min(next_at, self._events[0][0])
-        if self.engine.holders and self.engine.has_waiting:  # it may overtake by then
+        if self.engine.interpreter.is_wanted():  # it may overtake by then
             next_at = min(next_at, self.now + POLL_NS)
         if next_at > self.end + DRAIN_NS:
             return False

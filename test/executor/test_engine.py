@@ -89,7 +89,7 @@ class Driver:
             while releases and releases[0][0] == now:
                 source = self.entities[self.tables.source[releases.pop(0)[1]]]
                 self.engine.timer_due(Work(source, print), now, now)
-            while (work := self.engine.dispatch(0, now)) is not None:
+            while (work := self.engine.step(0, now).work) is not None:
                 self.note(now, 'start', work)
                 _, dag, _, vertex = work.origin
                 ticks = self.case.ticks[dag][self.tables.index_in_dag[vertex]]
@@ -134,7 +134,7 @@ def test_which_releases_of_a_timer_give_way_to_newer_ones(keys, release, dropped
     for due in range(0, 61 * MS, 20 * MS):
         engine.timer_due(Work(timer, print), due, due)
         engine.validate()
-    work = engine.dispatch(0, 61 * MS)
+    work = engine.step(0, 61 * MS).work
     assert engine.release_of(work) == release * MS
     assert (timer.dropped, timer.skipped) == (dropped, 0 if dropped else 2)
 
@@ -153,7 +153,7 @@ class OneUser:
     def publish(self, time):
         """Run the timer; return the origin of what it publishes."""
         self.engine.timer_due(Work(self.source, print), time, time)
-        running = self.engine.dispatch(0, time)
+        running = self.engine.step(0, time).work
         self.engine.finished(running, time, time, time, 0, 0)
         return running.origin
 
@@ -172,7 +172,7 @@ def test_late_messages_of_a_full_queue_are_dropped_with_the_oldest(on_late, drop
     origins = [one.publish(time) for time in times]
     last = [one.hear(origin, times[-1]) for origin in origins][-1]
     assert one.user.dropped == dropped and len(one.user.waiting) == 5 - dropped
-    assert (one.engine.dispatch(0, times[-1]) is last) == (on_late == 'demote')
+    assert (one.engine.step(0, times[-1]).work is last) == (on_late == 'demote')
 
 
 class Robot:
@@ -206,7 +206,7 @@ class Robot:
         engine, now, due = self.engine, 0, {self.controller: 0, self.camera: 0}
         while now < end:
             self.fire(due, now)
-            work = engine.dispatch(0, now)
+            work = engine.step(0, now).work
             if work is None:
                 now = min(due.values())
                 continue
@@ -271,7 +271,7 @@ def flooded(depths, tick_ms=2):
                 entity = entities[messages % len(entities)]
                 engine.ready(Work(entity, print, (messages,)), now)
                 messages += 1
-        work = engine.dispatch(0, now)
+        work = engine.step(0, now).work
         if work is None:
             now = min(ticks * 10, messages) * 10 * MS
             continue
@@ -312,7 +312,7 @@ def test_the_first_executions_of_a_callback_do_not_count():
 def test_a_message_of_a_job_comes_to_a_queue_that_is_full_of_short_ones_without_a_job():
     one = OneUser(depth=2)
     works = [one.hear(origin, 0) for origin in (None, None, one.publish(0))]
-    assert [one.engine.dispatch(0, 0), one.user.dropped] == [works[1], 1]
+    assert [one.engine.step(0, 0).work, one.user.dropped] == [works[1], 1]
 
 
 @pytest.mark.parametrize('policy', ['rad', 'gedf', 'fifo'])
@@ -322,7 +322,7 @@ def test_a_second_message_of_a_publication_comes_after_the_first(policy):
     origin = one.publish(0)
     messages = [one.hear(origin, time) for time in range(3)]
     for time, message in enumerate(messages, 3):
-        assert one.engine.dispatch(0, time) is message
+        assert one.engine.step(0, time).work is message
         one.engine.finished(message, 0, time, time, 0, 0)
 
 
@@ -334,11 +334,11 @@ def test_messages_without_a_job_keep_their_order_behind_a_late_one(policy):
     now = 600 * MS
     late = one.hear(origins[0], now)
     one.engine.ready(other, now)
-    ran = [one.engine.dispatch(0, now)]
+    ran = [one.engine.step(0, now).work]
     messages = [late, *(one.hear(origin, now) for origin in (None, origins[1], None))]
     for _ in messages:
         one.engine.finished(ran[-1], now, now, now, 0, 0)
-        ran.append(one.engine.dispatch(0, now))
+        ran.append(one.engine.step(0, now).work)
     assert [([other] + messages).index(work) for work in ran] == [0, 1, 3, 2, 4]
 
 
@@ -347,15 +347,15 @@ def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_mo
     engine, user = new_engine(workers=2), new_entity(holds=True)
     other = Work(new_entity(holds=True), print)
     engine.ready(other, 0)
-    assert engine.dispatch(0, 0) is other
+    assert engine.step(0, 0).work is other
     messages = [Work(user, print) for _ in range(2)]
     for message in messages:
         engine.ready(message, 1)
-        assert engine.dispatch(1, 1) is None
+        assert engine.step(1, 1).work is None
         user.habit.holds = 0
         engine.validate()
     engine.finished(other, 1, 1, 1, 0, 0)
-    assert [engine.dispatch(worker, 1) for worker in (0, 1)] == messages
+    assert [engine.step(worker, 1).work for worker in (0, 1)] == messages
 
 
 @examples(150)
@@ -369,17 +369,17 @@ def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
         begun = []
         if isinstance(step, bool):
             engine.ready(Work(entities[step], print), now)
-            begun.append(engine.dispatch(0, now))
+            begun.append(engine.step(0, now).work)
         elif step in running:
             engine.finished(running.pop(step), now, now, now, 0, step)
-            begun.append(engine.dispatch(step, now))
-        while begun and engine.may_start_more(now) and (len(begun) == 1 or begun[-1] is not None):
-            begun.append(engine.dispatch(0, now))
+            begun.append(engine.step(step, now).work)
+        while begun and engine.look(now).more and (len(begun) == 1 or begun[-1] is not None):
+            begun.append(engine.step(0, now).work)
         running |= {work.worker: work for work in begun if work is not None}
         engine.validate()
         if len(running) < engine.n_workers:
             assert not entities[0].waiting
-            assert not entities[1].waiting or engine.holders
+            assert not entities[1].waiting or engine.interpreter.holders
         assert sum(work.entity.habit.holds for work in running.values()) <= 1
 
 
@@ -399,23 +399,23 @@ def test_a_holder_that_takes_longer_than_usual_is_overtaken_when_the_engine_says
         entity.habit = GilHabit(True)
         entity.habit.mean_ns = mean
     engine.ready(Work(long, print), 0)
-    assert engine.dispatch(0, 0) is not None
+    assert engine.step(0, 0).work is not None
     now = arrival * MS
     if has_ended:
         engine.timer_due(Work(urgent, print), now, now)
-        engine.holders[-1].entity.habit.mean_ns = 10 ** 9
-        other = engine.dispatch(1, now)
+        engine.interpreter.holders[-1].entity.habit.mean_ns = 10 ** 9
+        other = engine.step(1, now).work
         long.habit.mean_ns = usual * MS
         engine.finished(other, now, now, now, 0, 1)
     engine.timer_due(Work(urgent, print), now, now)
-    at = engine.overtaking_at()
+    at = engine.interpreter.overtaking_at()
     assert at == usual * MS + 5 * MS  # half of the deadline
     if arrival <= usual - 5:  # it takes long enough even if it takes as long as usual
-        assert engine.dispatch(1, now) is not None
+        assert engine.step(1, now).work is not None
         return
     if now < at:
-        assert engine.dispatch(1, at - 1) is None
-    assert engine.dispatch(1, max(at, now)) is not None
+        assert engine.step(1, at - 1).work is None
+    assert engine.step(1, max(at, now)).work is not None
 
 
 @pytest.mark.parametrize('deadline, most', [('20ms', 0.8), ('5ms', 0.6), ('1s', 4)])
@@ -424,14 +424,14 @@ def test_what_is_urgent_waits_less_for_a_callback_that_was_expected_to_end(deadl
     task_set = loads(graph(n=f'name: a, subscription: /a, period: 1s, deadline: {deadline}'))
     engine = new_engine(task_set, workers=2)
     entity = entity_of(engine, task_set, 0, 0)
-    assert engine.patience() == 4 * MS
+    assert engine.interpreter.patience() == 4 * MS
     engine.arrived(Work(entity, print), None, 0, -1, 0)
-    assert engine.patience() == most * MS
+    assert engine.interpreter.patience() == most * MS
     check = GilCheck()
-    check.begin(engine, 0, 2 * MS, engine.patience() // 2)
+    check.begin(engine, 0, 2 * MS, engine.interpreter.patience() // 2)
     assert check.at == 2 * MS
     check.waits(threading.get_ident(), threading.get_native_id(), 2 * MS)
-    assert check.at == 2 * MS + engine.patience() // 2
+    assert check.at == 2 * MS + engine.interpreter.patience() // 2
 
 
 def test_the_time_of_pauses_does_not_count_as_held():
@@ -440,11 +440,12 @@ def test_the_time_of_pauses_does_not_count_as_held():
     entity = new_entity(holds=True)
     entity.habit.mean_ns = 5 * MS
     engine.ready(Work(entity, print), 0)
-    work = engine.dispatch(0, MS)
-    assert engine.usual_end(work) == 11 * MS
-    pays_at = engine.overtaking_at()
+    work = engine.step(0, MS).work
+    assert engine.interpreter.usual_end(work) == 11 * MS
+    pays_at = engine.interpreter.overtaking_at()
     work.paused_ns = 3 * MS
-    assert engine.usual_end(work) == 14 * MS and engine.overtaking_at() == pays_at + 3 * MS
+    assert engine.interpreter.usual_end(work) == 14 * MS
+    assert engine.interpreter.overtaking_at() == pays_at + 3 * MS
 
 
 @pytest.mark.parametrize('kind, deadline, part', [
@@ -490,7 +491,7 @@ class Steps:
             else:
                 engine.timer_due(work, now, now)
         elif step == 'dispatch':
-            started = engine.dispatch(which % 2, now)
+            started = engine.step(which % 2, now).work
             self.returning = [each for each in self.returning if each is not started]
             self.running += [started] * (started is not None)
         elif step == 'remove':
@@ -529,7 +530,7 @@ class Steps:
         engine = self.engine
         return (
             started and (started.args, started.worker), engine.queue_length, engine.has_waiting,
-            engine.idle_workers, engine.may_start_more(now),
+            engine.idle_workers, engine.look(now).more,
             [(len(each.waiting), each.ran, each.dropped, each.skipped, each.failed)
              for each in self.entities])
 
@@ -563,7 +564,7 @@ def test_work_of_an_entity_starts_in_its_order_and_is_never_lost(policy, slow, s
             numbers = [work.args[0] for work in started.values() if work.entity is entity]
             assert numbers == sorted(numbers)
             assert not entity.depth or len(entity.waiting) <= entity.depth
-    while engine.idle_workers and (work := engine.dispatch(0, now)) is not None:
+    while engine.idle_workers and (work := engine.step(0, now).work) is not None:
         engine.finished(work, now, now, now, 0, work.worker)
     if engine.idle_workers == engine.n_workers and max(engine._state.group_owner) < 0:
         assert not any(entity.waiting for entity in each.entities)

@@ -85,6 +85,32 @@ def test_the_deadline_of_a_job_that_was_in_time_wakes_no_thread(make_executor, m
         assert wait_for(lambda: executor._pool.polling and waits_for_no_timer(executor))
 
 
+def test_after_a_short_callback_that_is_rare_no_thread_looks(
+        make_executor, make_node, monkeypatch):
+    """A parked thread was to look in case that it would have taken long."""
+    monkeypatch.setattr('mddag_executor.executor.engine.NET_NS', 600_000 * MS)
+    node, was_set = make_node(), []
+    executor = make_executor(nodes=[node])
+    pool = executor._pool
+    node.create_subscription(
+        Header, '/go', lambda _: was_set.append(pool.parking.watch.at < NEVER), 10)
+    go = node.create_publisher(Header, '/go', 10)
+
+    def publish():
+        ran = len(was_set)
+        go.publish(Header())
+        assert wait_for(lambda: len(was_set) > ran)
+        assert wait_for(lambda: pool.polling and pool.loop.timer.at > 0)
+        time.sleep(0.01)
+        return was_set[-1]
+
+    with Spinning(executor):
+        matched(go)
+        assert wait_for(publish)
+        go.publish(Header())
+        assert wait_for(lambda: pool.polling and pool.parking.watch.at == NEVER)
+
+
 def test_a_timer_that_was_cancelled_runs_when_it_is_reset(make_executor, make_node, spinning):
     node, ran = make_node(), []
     timer = node.create_timer(0.01, lambda: ran.append(1), autostart=False)
