@@ -50,7 +50,7 @@ test: env
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 # The tests that run ROS, in an environment with ROS 2 Kilted instead of Jazzy.
-LIVE_TESTS := test/executor test/hosting test/rerun test/examples test/hardening/test_misuse.py \
+LIVE_TESTS := test/executor test/hosting test/synthetic test/rerun test/examples test/hardening/test_misuse.py \
 	$(addprefix test/cli/test_,$(addsuffix .py,demo graph rerun run top))
 
 # With another rclpy than the index has: RCLPY is a folder with its package rclpy/, the extension

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import statistics
 from typing import Any
 
+from mddag_executor.child import ChildError, CrashError, run_child
 from mddag_executor.core import policy as find_policy
 from mddag_executor.errors import UsageError
-from mddag_executor.hosting.child import ChildError, CrashError, run_child
 
 OURS = 'rad'
 """The name of this executor."""

@@ -139,7 +139,7 @@ def _graph(args: argparse.Namespace) -> Iterator[str | None]:
     if args.load not in DECLARED:
         yield None
         return
-    from mddag_executor.hosting.measure import ExecutionPlan
+    from mddag_executor.synthetic.measure import ExecutionPlan
     from msg_graph import load, loads
     with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
         path = args.graph or str(find(DECLARED[args.load]))

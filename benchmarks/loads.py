@@ -31,7 +31,8 @@ from benchmarks.publisher import PublisherProcess
 from mddag_executor.core import quantile
 from mddag_executor.executor import current_job
 from mddag_executor.executor.quiet_nodes import quiet_node
-from mddag_executor.hosting.measure import (
+from mddag_executor.resources import find
+from mddag_executor.synthetic.measure import (
     ExecutionPlan,
     judge_sink,
     measure,
@@ -39,9 +40,8 @@ from mddag_executor.hosting.measure import (
     totals,
     WARM_UP_S,
 )
-from mddag_executor.hosting.peers import run_nodes, UnfinishedSession
-from mddag_executor.hosting.synthetic import no_job, QOS, SyntheticWorkload
-from mddag_executor.resources import find
+from mddag_executor.synthetic.peers import run_nodes, UnfinishedSession
+from mddag_executor.synthetic.workload import no_job, QOS, SyntheticWorkload
 from msg_graph import load, TaskSet
 import rclpy
 from rclpy.node import Node

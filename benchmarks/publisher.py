@@ -25,10 +25,10 @@ import random
 import time
 from typing import Any
 
+from mddag_executor.child import ChildError
 from mddag_executor.executor.quiet_nodes import quiet_node
-from mddag_executor.hosting.child import ChildError
-from mddag_executor.hosting.session import MATCH_TIMEOUT_S
-from mddag_executor.hosting.synthetic import QOS
+from mddag_executor.executor.session import MATCH_TIMEOUT_S
+from mddag_executor.synthetic.workload import QOS
 import rclpy
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions

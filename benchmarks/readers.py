@@ -18,7 +18,7 @@ import resource
 import time
 from typing import Any
 
-from mddag_executor.hosting.child import run_child
+from mddag_executor.child import run_child
 from mddag_executor.simulate import (
     draw_execution_times,
     periodic_load,

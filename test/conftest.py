@@ -166,7 +166,8 @@ def pytest_runtest_makereport(item, call):
 # What runs ROS, or waits as time passes. Side by side (`make test`) a process takes whole files of
 # these, which come first: most of their time they wait, so that both take what is left then.
 ROS = (
-    'executor', 'hosting', 'benchmarks', 'launch', 'examples', 'hardening/test_misuse.py',
+    'executor', 'hosting', 'synthetic', 'benchmarks', 'launch', 'examples',
+    'hardening/test_misuse.py',
     'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph.py',
     'test_docs.py')
 

@@ -6,7 +6,7 @@ The verb `demo`: the whole Autoware workload, run, recorded, replayed and compar
 Each step is a command in a process of its own, which is shown with its output: `mddag run`, which
 records, and `mddag replay`, as recorded and rescheduled.  Then the same nodes, seed and number of
 threads run on rclpy's MultiThreadedExecutor; the nodes measure both executors in the same way
-(`mddag_executor.hosting.measure`).
+(`mddag_executor.synthetic.measure`).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
         show, output / 'rescheduled.json', None, 'replay', trace, graph, '--reschedule')
     seconds = args.duration / 2e9
     show(f"\n== The same nodes on rclpy's MultiThreadedExecutor({WORKERS}), {seconds:g} s ==")
-    from mddag_executor.hosting.peers import measure_peer
+    from mddag_executor.synthetic.peers import measure_peer
     with Progress('measuring', seconds + 3) as progress:
         peer = measure_peer(graph, WORKERS, seconds=seconds, seed=SEED,
                             utilisation=args.utilisation, tick=progress.update)

@@ -38,12 +38,13 @@ from msg_graph import EMPTY_TASK_SET, loads
 
 if TYPE_CHECKING:
     from mddag_executor.executor.executor import MultiDeadlineExecutor
+    from mddag_executor.executor.session import Session
     from mddag_executor.executor.watch import Watch
-    from mddag_executor.hosting.host import Guest, Host
+    from mddag_executor.hosting.guest import Guest
+    from mddag_executor.hosting.host import Host
     from mddag_executor.hosting.loading import Program
-    from mddag_executor.hosting.measure import ExecutionPlan, Ledger
-    from mddag_executor.hosting.session import Session
     from mddag_executor.hosting.signals import Signals
+    from mddag_executor.synthetic.measure import ExecutionPlan, Ledger
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -218,7 +219,7 @@ def run_here(
     # What the end needs is imported here: an interrupt of an import in a program may keep the lock
     # of the imported module for ever.
     from mddag_executor.hosting import processes  # noqa: F401
-    from mddag_executor.hosting.measure import ExecutionPlan
+    from mddag_executor.synthetic.measure import ExecutionPlan
     if args.synthetic is not None:
         plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
     with ExitStack() as stack:
@@ -314,8 +315,8 @@ def _run(
 
     :param leave: see ``Host.run``.
     """
+    from mddag_executor.executor.session import Session
     from mddag_executor.executor.watch import Watch
-    from mddag_executor.hosting.session import Session
 
     def end_begins() -> None:
         # a native thread writes the stacks, even if the thread that holds the GIL is stuck
@@ -345,7 +346,7 @@ def _result(
     ledger: Ledger | None = None, plan: ExecutionPlan | None = None,
 ) -> dict[str, Any]:
     """Return the result of a run that has ended."""
-    from mddag_executor.hosting.measure import measure
+    from mddag_executor.synthetic.measure import measure
     executor: Any = session.executor
     counts = executor.statistics()
     if counts['trace'] is not None:
@@ -385,7 +386,7 @@ def _run_synthetic(
     seconds: float | None, progress: Progress,
 ) -> Ledger | None:
     from mddag_executor.executor import current_job
-    from mddag_executor.hosting.synthetic import SyntheticWorkload
+    from mddag_executor.synthetic.workload import SyntheticWorkload
     workload = SyntheticWorkload(
         task_set, plan, current_job=current_job, process=args.process)
     for node in workload.nodes:
@@ -405,8 +406,8 @@ def _run_synthetic(
 
 def _begin(args: argparse.Namespace, task_set: TaskSet) -> Callable[..., int | None]:
     """Return what waits until endpoints have discovered each other, and for other processes."""
+    from mddag_executor.executor.session import Session
     from mddag_executor.hosting.processes import Part
-    from mddag_executor.hosting.session import Session
     if args.part is None:
         return Session.wait_until_matched
     return partial(Part.read(args.part).start_together, args.process,
@@ -417,8 +418,8 @@ def _run_programs(
     args: argparse.Namespace, task_set: TaskSet, session: Session, watch: Watch, host: Host,
     programs: list[Program], seconds: float | None,
 ) -> tuple[dict[str, Any], BaseException | None]:
+    from mddag_executor.executor.session import SessionError
     from mddag_executor.hosting.loading import MainFailed, ProgramFailed, ros_arguments
-    from mddag_executor.hosting.session import SessionError
     executor: Any = session.executor
     executor.set_judging(False)
     try:

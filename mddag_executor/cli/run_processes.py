@@ -48,7 +48,6 @@ def with_declared(args: argparse.Namespace, task_set: TaskSet) -> TaskSet:
 
 def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
     """Run nodes in several processes until the run ends, and print what came of the deadlines."""
-    from mddag_executor.hosting.measure import ExecutionPlan
     from mddag_executor.hosting.processes import (
         combine_results,
         Part,
@@ -57,6 +56,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         Run,
         Supervisor,
     )
+    from mddag_executor.synthetic.measure import ExecutionPlan
     plan = None
     if args.synthetic is not None:
         workers = defaults.workers(args.workers, task_set)

@@ -18,21 +18,19 @@ the time, so there each node has a group.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol
 
 from mddag_executor.executor.compat import is_called_by_spin
 from mddag_executor.executor.outer_groups import outer_here
 from mddag_executor.executor.tasks import watched
+from mddag_executor.hosting.guest import Guest
 from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
-
-if TYPE_CHECKING:
-    from mddag_executor.hosting.host import Guest, Host
 
 _STEP_S = 0.01
 """A step of unknown callbacks ends after this time."""
@@ -42,6 +40,51 @@ _POLL_S = 0.0005
 _UNBOUNDED = 1 << 30
 _MOST_ERRORS = 100
 """At most this many exceptions are kept for the next spin: the program does not handle them."""
+
+
+class HostOfExecutors(Protocol):
+    """What the executors of programs need of their host; see ``host.Host``."""
+
+    executor: Any
+
+    def is_ending(self) -> bool:
+        """Return whether the run is to end."""
+
+    def is_over(self, guest: Guest | None) -> bool:
+        """Return whether the run or the program has ended."""
+
+    def wait(
+        self, changed: threading.Condition, until: Callable[[], bool], timeout_s: float | None,
+        guest: Guest | None,
+    ) -> None:
+        """Wait until a condition is true, the run or the program ends, or the timeout is over."""
+
+    def take_interrupt(self, guest: Guest | None) -> bool:
+        """Return whether the calling thread is that of a main which a SIGINT has interrupted."""
+
+    def note_interrupt(self) -> None:
+        """Note a KeyboardInterrupt in the main thread."""
+
+    def itself(self, node: Any) -> Any:
+        """Return the node behind an object that only passes on to one."""
+
+    def adopt(self, node: Node, guest: Guest | None) -> None:
+        """Add a program's node to the executor."""
+
+    def release(self, node: Node, guest: Guest | None) -> None:
+        """Remove a program's node from the executor."""
+
+    def group_of(self, owner: Any) -> Any:
+        """Return the outer group of an executor's callbacks, or a node's; None: none."""
+
+    def put(self, node: Node, group: Any) -> None:
+        """Let the callbacks of a node belong to an outer group."""
+
+    def note_group(self, group: Any, executor: Any) -> None:
+        """Note whose spin has opened an outer group."""
+
+    def note_waiting(self, groups: Iterable[Any]) -> None:
+        """Count how long callbacks have waited for others in outer groups."""
 
 
 class GuestExecutor:
@@ -55,7 +98,7 @@ class GuestExecutor:
     :ivar is_pool: whether its callbacks are in no outer group.
     """
 
-    host: Host
+    host: HostOfExecutors
     guest: Guest | None
     is_global = False
     _changed: threading.Condition
@@ -278,7 +321,7 @@ def _limit(executor: Any) -> int:
     return _UNBOUNDED  # its threads are its own
 
 
-def make_guest(executor: Any, host: Host, guest: Guest | None) -> None:
+def make_guest(executor: Any, host: HostOfExecutors, guest: Guest | None) -> None:
     """Make a ``GuestExecutor`` of an executor."""
     executor.__class__ = _guest_class(executor.__class__)
     executor.host, executor.guest = host, guest

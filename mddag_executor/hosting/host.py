@@ -46,7 +46,6 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
 import os
@@ -61,6 +60,7 @@ import weakref
 from mddag_executor.executor.compat import alive, executor_kept
 from mddag_executor.executor.registry import snapshot
 from mddag_executor.executor.work import current
+from mddag_executor.hosting.guest import Guest
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
 from mddag_executor.hosting.signals import Signals
@@ -82,44 +82,6 @@ _SIGNALS_OF = {
     SignalHandlerOptions.SIGTERM: (signal.SIGTERM,)}
 
 Result = TypeVar('Result')
-
-
-@dataclass(eq=False)
-class Guest:
-    """
-    A running program.
-
-    :ivar nodes: its nodes on the executor.
-    :ivar has_begun: whether its main has begun, so that a signal reaches it.
-    :ivar is_complete: whether ``nodes`` holds all initial nodes, or the program has ended.
-    :ivar ended: whether its nodes run no more callbacks; it may initialise rclpy again.
-    :ivar finished: whether its main has ended.
-    :ivar returned: whether its main has returned nodes.
-    :ivar uses_ros: whether it has initialised rclpy.
-    :ivar error: the exception that has ended its main.
-    :ivar done: is set when all that follows its main is also done.
-    :ivar signals: those that rclpy handles for it, with the Python handler of each at that time,
-        which rclpy's calls.
-    :ivar interrupted: whether a SIGINT has come that its next spin raises.
-    :ivar waited_ns: how long its callbacks have waited for others of it, in groups that it has
-        closed.
-    """
-
-    program: Program
-    thread: threading.Thread = field(init=False)
-    nodes: list[Node] = field(default_factory=list)
-    has_begun: bool = False
-    is_complete: bool = False
-    ended: bool = False
-    finished: bool = False
-    returned: bool = False
-    uses_ros: bool = False
-    error: BaseException | None = None
-    done: threading.Event = field(default_factory=threading.Event)
-    signals: dict[int, Any] = field(default_factory=dict)
-    interrupted: bool = False
-    waited_ns: int = 0
-    global_executor: Any = None
 
 
 class Host:

@@ -45,11 +45,11 @@ import threading
 import time
 from typing import Any, BinaryIO, TextIO
 
+from mddag_executor.child import signal_at_end_of
 from mddag_executor.core.tally import of_processes
 from mddag_executor.errors import MddagError
 from mddag_executor.executor.entity import add_counts
-from mddag_executor.hosting.child import signal_at_end_of
-from mddag_executor.hosting.session import MATCH_TIMEOUT_S, Session
+from mddag_executor.executor.session import MATCH_TIMEOUT_S, Session
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
@@ -297,7 +297,7 @@ class Part:
 
         :param unmatched: returns the topics on which publishers and subscriptions have not
             discovered each other; ``patience_s``: how long to wait for progress.
-        :raises mddag_executor.hosting.session.SessionError: when discovery fails.
+        :raises mddag_executor.executor.session.SessionError: when discovery fails.
         """
         self._reach('made', name, names, session)
         session.wait_until_matched(

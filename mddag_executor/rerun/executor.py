@@ -10,7 +10,8 @@ from typing import Any
 from mddag_executor.executor.compat import alive, BareExecutor, QuickCallback
 from mddag_executor.executor.tasks import make_task, TaskEntity, Unclaimed
 from mddag_executor.executor.work import Work
-from mddag_executor.hosting.host import Guest, Host
+from mddag_executor.hosting.guest import Guest
+from mddag_executor.hosting.host import Host
 from mddag_executor.rerun.loop import Loop, POLL_NS
 from rclpy.node import Node
 from rclpy.task import Task

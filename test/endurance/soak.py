@@ -45,8 +45,8 @@ import time
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
 from mddag_executor.executor.quiet_nodes import quiet_node
-from mddag_executor.hosting.measure import ExecutionPlan
-from mddag_executor.hosting.synthetic import SyntheticWorkload
+from mddag_executor.synthetic.measure import ExecutionPlan
+from mddag_executor.synthetic.workload import SyntheticWorkload
 from msg_graph import load
 from msg_graph.model import path_lengths
 import rclpy

@@ -15,7 +15,8 @@ import threading
 import time
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.hosting.host import Guest, Host
+from mddag_executor.hosting.guest import Guest
+from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
 from mddag_executor.hosting.signals import SAME_SIGNAL_S
 import pytest

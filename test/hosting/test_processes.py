@@ -13,8 +13,8 @@ import sys
 from mddag_executor import replay
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
+from mddag_executor.executor.session import Session
 from mddag_executor.hosting import processes
-from mddag_executor.hosting.session import Session
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest

@@ -8,10 +8,10 @@ import subprocess
 import sys
 import threading
 
+from mddag_executor.child import ChildError, CrashError, run_child
+from mddag_executor.executor.session import Session
 from mddag_executor.hosting import processes as module
-from mddag_executor.hosting.child import ChildError, CrashError, run_child
 from mddag_executor.hosting.processes import Supervisor
-from mddag_executor.hosting.session import Session
 import pytest
 
 from .conftest import has_ended, wait_for
@@ -115,7 +115,7 @@ def test_what_the_child_refuses_is_its_message_and_its_output_is_not_shown(capfd
 
 
 @pytest.mark.parametrize('code', [
-    'from mddag_executor.hosting.child import run_child; '
+    'from mddag_executor.child import run_child; '
     'run_child("builtins:exec", ({body!r},), "it", 60.0)',
     'import subprocess, sys; subprocess.run([sys.executable, "-c", "import os; from '
     'mddag_executor.hosting.processes import belong_to_parent; belong_to_parent(os.getppid());" '

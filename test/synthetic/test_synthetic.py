@@ -7,15 +7,15 @@ import time
 
 from mddag_executor.executor import current_job
 from mddag_executor.executor.executor import MultiDeadlineExecutor
-from mddag_executor.hosting.bodies import spin
-from mddag_executor.hosting.measure import ExecutionPlan, Ledger, measure, Reading
-from mddag_executor.hosting.session import Session
-from mddag_executor.hosting.synthetic import SyntheticWorkload
+from mddag_executor.executor.session import Session
+from mddag_executor.synthetic.bodies import spin
+from mddag_executor.synthetic.measure import ExecutionPlan, Ledger, measure, Reading
+from mddag_executor.synthetic.workload import SyntheticWorkload
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
-from .conftest import TWO_PROCESSES
+from ..hosting.conftest import TWO_PROCESSES
 
 MS = 1_000_000
 
@@ -120,13 +120,13 @@ def test_a_process_prepares_only_what_it_runs(ros_context, monkeypatch):
     plan = next(plan for seed in range(99) if [
         (plan := ExecutionPlan(task_set, seed, mode='mixed')).body(vertex)
         for vertex in task_set.vertices] == ['spin', 'native'])
-    monkeypatch.delattr('mddag_executor.hosting.synthetic.native')  # its speed takes time
+    monkeypatch.delattr('mddag_executor.synthetic.workload.native')  # its speed takes time
     SyntheticWorkload(task_set, plan, context=ros_context, process='one').destroy()
 
 
 def test_every_release_reaches_every_sink(task_set, ros_context, monkeypatch):
     """And the ledger of a long run is bounded."""
-    monkeypatch.setattr('mddag_executor.hosting.synthetic.MOST_MEASURED_S', 0.8)
+    monkeypatch.setattr('mddag_executor.synthetic.workload.MOST_MEASURED_S', 0.8)
     executor = MultiDeadlineExecutor(task_set, context=ros_context)
     workload = SyntheticWorkload(
         task_set, ExecutionPlan(task_set), context=ros_context, current_job=current_job)

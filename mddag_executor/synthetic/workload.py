@@ -40,20 +40,20 @@ import threading
 import time
 from typing import Any, NamedTuple
 
+from mddag_executor.child import Tick
 from mddag_executor.core import legs_of
 from mddag_executor.executor.jobs import header_stamp
 from mddag_executor.executor.listeners import NextCall
 from mddag_executor.executor.quiet_nodes import quiet_node
-from mddag_executor.hosting.bodies import Emulate, native, sleeper, spin, typical_oversleep_ns
-from mddag_executor.hosting.child import Tick
-from mddag_executor.hosting.measure import (
+from mddag_executor.executor.session import Session
+from mddag_executor.synthetic.bodies import Emulate, native, sleeper, spin, typical_oversleep_ns
+from mddag_executor.synthetic.measure import (
     Body,
     ExecutionPlan,
     Ledger,
     MOST_MEASURED_S,
     WARM_UP_S,
 )
-from mddag_executor.hosting.session import Session
 from msg_graph import Callback, Dag, TaskSet, Vertex
 from rcl_interfaces.srv import ListParameters
 from rclpy.callback_groups import (
@@ -284,7 +284,7 @@ class SyntheticWorkload:
         :param begin: waits until publishers and subscriptions have discovered each other, and for
             other processes.
         :return: whether there is a window: the run was not stopped before it began.
-        :raises mddag_executor.hosting.session.SessionError: when discovery fails.
+        :raises mddag_executor.executor.session.SessionError: when discovery fails.
         """
         self.ledger.is_open = True
         try:

@@ -22,8 +22,8 @@ import math
 import threading
 import time
 
+from mddag_executor.child import Tick
 from mddag_executor.errors import MddagError
-from mddag_executor.hosting.child import Tick
 from mddag_executor.text import counted
 from rclpy.executors import Executor, ExternalShutdownException
 

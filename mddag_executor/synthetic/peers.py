@@ -14,10 +14,10 @@ import gc
 import time
 from typing import Any, cast
 
-from mddag_executor.hosting.child import ChildError, run_child, Tick
-from mddag_executor.hosting.measure import ExecutionPlan, measure
-from mddag_executor.hosting.session import Session
-from mddag_executor.hosting.synthetic import SyntheticWorkload
+from mddag_executor.child import ChildError, run_child, Tick
+from mddag_executor.executor.session import Session
+from mddag_executor.synthetic.measure import ExecutionPlan, measure
+from mddag_executor.synthetic.workload import SyntheticWorkload
 from msg_graph import load
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor
