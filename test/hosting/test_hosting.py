@@ -393,8 +393,8 @@ def test_executors_that_a_program_makes_again_and_again_leave_nothing_behind(def
         assert host.guests[0].error is None
         assert len(executor._engine.scheduler.state.outer_limit) < 10
         assert len(executor._pool.outer_groups) + len(host._opened) < 10
-    executor.shutdown()
     spin.join()
+    executor.shutdown()
 
 
 def test_a_second_interrupt_leaves_no_group_open(host):
