@@ -15,6 +15,7 @@ import threading
 import time
 
 from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor.session import Session
 from mddag_executor.hosting.guest import Guest
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
@@ -385,16 +386,14 @@ def test_executors_that_a_program_makes_again_and_again_leave_nothing_behind(def
             gc.collect()
 
     executor = MultiDeadlineExecutor(num_workers=2)
-    spin = threading.Thread(target=executor.spin)
-    spin.start()
-    with Host() as host:
-        host.start(executor, [Program('main', 'main', main)])
-        assert wait_for(lambda: host.guests[0].done.is_set(), 60.0)
-        assert host.guests[0].error is None
-        assert len(executor._engine.scheduler.state.outer_limit) < 10
-        assert len(executor._pool.outer_groups) + len(host._opened) < 10
-    spin.join()
-    executor.shutdown()
+    with Session(executor) as session:
+        with Host() as host:
+            host.start(executor, [Program('main', 'main', main)])
+            assert wait_for(lambda: host.guests[0].done.is_set(), 60.0)
+            assert host.guests[0].error is None
+            assert len(executor._engine.scheduler.state.outer_limit) < 10
+            assert len(executor._pool.outer_groups) + len(host._opened) < 10
+        assert wait_for(lambda: session.stopped)
 
 
 def test_a_second_interrupt_leaves_no_group_open(host):
