@@ -17,12 +17,14 @@ and ends.  A thread may be interrupted just between an end and its report, and w
 has reported meanwhile may depend on it.  So verdicts are found from the recorded times alone:
 starts, publications and ends wait here, and take effect in the order of their times, when none
 with an earlier time can come any more.  Executions that are dispatched but not reported may still
-bring times from their dispatch on.  The order at the same instant is: ends, publications, starts.
+bring times from their dispatch on.  The order at the same instant is: ends, publications, starts,
+each in the order of the path.
 A result in between takes what still waits as complete, on a copy.
 
-A change is found to be not due when the next output comes.  A replay knows what follows: that an
-output with just this input comes after that of a newer one, or that a value with which nothing
-was published is read again and leads to an output.
+A change that is not due when an output answers it may still turn out to be due: an output with
+just this input may come after that of a newer one, or a value with which nothing was published is
+read again and leads to an output.  So the last answered changes are kept, in order, from the first
+one that may still change.
 
 A path is only judged in a process that runs all of its callbacks.
 """
@@ -42,6 +44,10 @@ from msg_graph.segments import Hop, hops, may_end
 _KEEP_RESPONSES = 2_000
 _REMEMBERED = 256
 """Jobs of a vertex that are remembered."""
+_MOST_ANSWERED = 200
+"""Answered changes that are kept because it may turn out that they were due after all."""
+_FORGOTTEN = -1
+"""Instead of the number of a value with which nothing was published."""
 _MOST_PENDING = 1_000
 _MOST_WAITING = 3_000
 """Starts, publications and ends that wait for an execution that does not end."""
@@ -155,8 +161,30 @@ class _Run:
         self.number = self.value = 0
 
 
-_Event = tuple[int, int, int, _Run, bool]
-"""Time, kind, a number, the execution, and whether it is its last end."""
+class _Answered:
+    """
+    A change that an output has answered.
+
+    :ivar newest: the first input that sees it; ``took``: the time until the output.
+    :ivar silent: the values because of which it is not due; empty: it is due.
+    """
+
+    __slots__ = ('newest', 'took', 'silent')
+
+    def __init__(self, newest: int, took: int, silent: set[int]) -> None:
+        self.newest = newest
+        self.took = took
+        self.silent = silent
+
+    def count_in(self, tally: RequirementTally) -> None:
+        if self.silent:
+            tally.add_not_due()
+        else:
+            tally.add(self.took)
+
+
+_Event = tuple[int, int, int, int, _Run, bool]
+"""Time, kind, position, a number, the execution, and whether it is its last end."""
 
 
 class _Path:
@@ -194,17 +222,18 @@ class _Path:
         for event in self._all_of(run, pieces, times):
             heappush(self._events, event)
         end = pieces[-1][1]
-        heappush(self._events, (end, _END, self._next(), run, True))
+        heappush(self._events, (end, _END, position, self._next(), run, True))
 
     def _all_of(
         self, run: _Run, pieces: list[tuple[int, int]], times: list[int],
     ) -> Iterator[_Event]:
         """Yield the start of an execution, its publications, and the ends of all but the last."""
-        yield pieces[0][0], _START, self._next(), run, False
+        position = run.position
+        yield pieces[0][0], _START, position, self._next(), run, False
         for time in times:
-            yield time, _PUBLICATION, self._next(), run, False
+            yield time, _PUBLICATION, position, self._next(), run, False
         for _, end in pieces[:-1]:
-            yield end, _END, self._next(), run, False
+            yield end, _END, position, self._next(), run, False
 
     def _next(self) -> int:
         self._number += 1
@@ -268,6 +297,11 @@ class _State:
         # inputs, and the changes that they will have seen, that are not answered yet
         self._pending: deque[tuple[int, int]] = deque()
         self._last_input: int | None = None
+        # the last ones that are answered; those of them that are not due, by their input, and by
+        # the values because of which they are not
+        self._answered: deque[_Answered] = deque()
+        self._not_due: dict[int, _Answered] = {}
+        self._because: dict[int, list[_Answered]] = {}
         # by value the input with which nothing was published: changes up to it are not due, unless
         # an output is based on just their input; values with which something was published
         self._silent: dict[int, int] = {}
@@ -277,13 +311,15 @@ class _State:
         self._tallies = {what: RequirementTally(path, required, _KEEP_RESPONSES)
                          for what, required in path.requirements.items()}
 
-    def take(self, time: int, kind: int, number: int, run: _Run, is_last: bool) -> None:
+    def take(
+        self, time: int, kind: int, position: int, number: int, run: _Run, is_last: bool
+    ) -> None:
         """Let a start, a publication or an end take effect."""
         if not run.is_begun:    # its start, or all are at the same instant
             self._begin(run, time, number)
         if kind == _START:
             return
-        position, found = run.position, run.found
+        found = run.found
         if position == self._last:
             if is_last and found is not None:
                 self._output(found, time, run.judge_from)
@@ -311,7 +347,7 @@ class _State:
         else:
             run.value, run.found = self._latest[run.position - 1]
         if run.position < self._last and self._may_end[run.position] and not run.is_silent:
-            self._silent.pop(run.value, None)
+            self._goes_on(run.value)
             self._went_on[run.value] = None
             if len(self._went_on) > _REMEMBERED:
                 del self._went_on[next(iter(self._went_on))]
@@ -334,12 +370,14 @@ class _State:
         self._pending.append((start, since))
         if len(self._pending) > _MOST_PENDING:
             newest, _ = self._pending.popleft()
-            if 'reaction' not in self._tallies:
-                pass
-            elif newest <= self._silent_to():
-                self._tallies['reaction'].add_not_due()
+            reaction = self._tallies.get('reaction')
+            if reaction is None:
+                return
+            self._count_answered(reaction, 0)
+            if newest <= self._silent_to():
+                reaction.add_not_due()
             else:
-                self._tallies['reaction'].add_missed()
+                reaction.add_missed()
 
     def _silent_to(self) -> int:
         """Return the last input with which nothing was published; -1: there is none."""
@@ -347,15 +385,17 @@ class _State:
 
     def _output(self, found: int, end: int, judge_from: int) -> None:
         reaction, age = self._tallies.get('reaction'), self._tallies.get('age')
-        silent_to = self._silent_to()
         while self._pending and self._pending[0][0] <= found:
             newest, since = self._pending.popleft()
-            if reaction is None:
-                continue
-            if newest != found and newest <= silent_to:
-                reaction.add_not_due()
-            else:
-                reaction.add(end - since)
+            if reaction is not None:
+                self._answer(_Answered(newest, end - since, set() if newest == found else {
+                    value for value, silent in (
+                        *self._silent.items(), (_FORGOTTEN, self._silent_before))
+                    if newest <= silent}))
+        if reaction is not None:
+            if found in self._not_due:  # of which just this is the output
+                self._not_due.pop(found).silent.clear()
+            self._count_answered(reaction, _MOST_ANSWERED)
         for value, silent in [*self._silent.items()]:
             if silent <= found:
                 del self._silent[value]
@@ -363,12 +403,44 @@ class _State:
             age.add(end - found)
             self._silent_since = end
 
+    def _answer(self, change: _Answered) -> None:
+        self._answered.append(change)
+        if change.silent:
+            self._not_due[change.newest] = change
+        for value in change.silent:
+            self._because.setdefault(value, []).append(change)
+
+    def _goes_on(self, value: int) -> None:
+        """Note that something is published with a value, perhaps after nothing was."""
+        self._silent.pop(value, None)
+        for change in self._because.pop(value, ()):
+            change.silent.discard(value)
+            if not change.silent:
+                self._not_due.pop(change.newest, None)
+
+    def _count_answered(self, tally: RequirementTally, most: int) -> None:
+        """Count changes that are certainly due, in order, and all but some of the others."""
+        answered = self._answered
+        while answered and (len(answered) > most or not answered[0].silent):
+            change = answered.popleft()
+            change.count_in(tally)
+            if change.silent:
+                del self._not_due[change.newest]
+                for value in change.silent:
+                    self._because[value].remove(change)
+                    if not self._because[value]:
+                        del self._because[value]
+
     def result(self, now: int, judge_from: int) -> dict[str, Any]:
         found = {}
         for what, tally in self._tallies.items():
             required = tally.relative_deadline_ns
             not_due = 0
             if what == 'reaction':
+                if self._answered:
+                    tally = copy.deepcopy(tally)
+                    for change in self._answered:
+                        change.count_in(tally)
                 silent_to = self._silent_to()
                 not_due = sum(newest <= silent_to for newest, _ in self._pending)
                 missed = sum(since + required <= now and newest > silent_to

@@ -294,3 +294,101 @@ def test_live_verdicts_and_bounds_in_random_systems(seeds):
                 assert each['response_ns']['max'] <= limit, (seed, what)
                 bounded += len(segments(task_set, task_set.paths[0])) > 1
     assert bounded > len(seeds) // 4
+
+
+# --- what is published sometimes, with executions that overtake each other --------------------
+
+SOMETIMES = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: look, timer: 10ms, publishes: [/seen]}
+  - node: /b
+    callbacks:
+      - {name: pick, subscription: /seen, may_publish: [/alarm]}
+  - node: /c
+    callbacks:
+      - {name: stop, subscription: /alarm, deadline: 10ms}
+paths:
+  - name: p
+    callbacks: ['/a:look', '/b:pick', '/c:stop']
+    reaction: 25ms
+    age: 20ms
+    tolerate: 1 of 5
+"""
+PICKS = {
+    'started': SOMETIMES,
+    'taken': SOMETIMES.replace('subscription: /seen', 'timer: 10ms, reads: [/seen]').replace(
+        'publishes: [/seen]', 'publishes: [/seen], deadline: none'),
+    'kept': SOMETIMES.replace(
+        '{name: pick, subscription: /seen', """{name: keep, subscription: /seen, deadline: none}
+      - {name: pick, timer: 10ms, reads: [keep]""").replace("'/b:pick'", "'/b:keep', '/b:pick'")}
+"""How the callback that may publish gets its data: by a message, a topic, or a variable."""
+
+
+def overtaking(told, chance, how):
+    """
+    Tell a run in which executions overtake each other, and half of the picks publish nothing.
+
+    Return the executions: callback, job, start, end, and when they published which topic.
+    """
+    ran, sent = [], set()
+
+    def run(key, job, start, message=None, topic=None, publishes=None):
+        sends, end = [], start
+        while (key, end) in sent or end == start:   # one after the other
+            end = start + chance.randrange(1, 40)
+        sent.add((key, end))
+        if publishes is not None:
+            free = [at for at in range(start, end + 1) if (publishes, at) not in sent]
+            sends = [(at, publishes) for at in free[:1]]
+            sent.update((publishes, at) for at, _ in sends)
+        told.ran(key, start, end, message, topic, sends)
+        ran.append((key, job, start, end, sends))
+        return end, sends[0][0] if sends else None
+
+    def pick(job, start, *message):
+        _, at = run('/b:pick', job, start, *message,
+                    publishes='/alarm' if chance.random() < 0.5 else None)
+        if at is not None:
+            run('/c:stop', job, at + chance.randrange(20), at, '/alarm')
+
+    for job in range(40):
+        _, at = run('/a:look', job, 10 * job, publishes='/seen')
+        if at is None:
+            continue
+        message = at + chance.randrange(25), at, '/seen'
+        if how == 'started':
+            pick(job, *message)
+            continue
+        if how == 'kept':
+            run('/b:keep', job, *message)
+        pick(job, 10 * job + chance.randrange(10))
+    return ran
+
+
+@pytest.mark.parametrize('how', PICKS)
+def test_live_verdicts_are_those_of_the_replay_if_executions_overtake_each_other(tmp_path, how):
+    for seed in range(25):
+        chance = random.Random(seed)
+        told = Told(tmp_path / f'{seed}.mcap', PICKS[how])
+        ran = overtaking(told, chance, how)
+        replayed = replay(told.write(), told.task_set).result()
+        watch = PathWatch(told.task_set, None)
+        vertex = {each.callback.key: v for v, each in enumerate(told.task_set.vertices)}
+        reports = []
+        for number, (_, _, start, end, _) in enumerate(ran):
+            reports += [(start * MS - 1, False, number),
+                        (end * MS + chance.randrange(30 * MS), True, number)]
+        for now, is_end, number in sorted(reports):
+            key, job, start, end, sends = ran[number]
+            if not is_end:
+                watch.begun(number, vertex[key], now)
+                continue
+            watch.ended(number, vertex[key], job, start * MS, end * MS, [
+                (topic, at * MS) for at, topic in sends if topic in watch.topics],
+                {topic for _, topic in sends} if key == '/b:pick' else None, 0)
+            watch.left(number)
+        until = max(end for _, _, _, end, _ in ran) * MS
+        assert watch.result(until, 0) == replayed['requirements'], seed
