@@ -197,7 +197,7 @@ class Announcements:
                 home, number, release, dag, vertex, topic = entry[5:]
                 self._engine.hear_silent(
                     Announced((home, number), dag, vertex, release + self._clock.offset_ns),
-                    self._topics[topic], self._pool.now)
+                    self._topics[topic], self._pool.tick())
             else:
                 self._note(*entry)
         for entry in list(self._waiting):
@@ -236,7 +236,7 @@ class Announcements:
 
     def _give(self, work: Work, origin: Origin | Announced | None) -> None:
         """Pass on a message after a possible wait for its announcement."""
-        now = self._pool.now
+        now = self._pool.tick()
         release = stamp = -1
         if isinstance(origin, Announced):
             release = origin.release + self._clock.offset_ns

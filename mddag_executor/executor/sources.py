@@ -171,8 +171,9 @@ class SubscriptionEntity(ArrivalEntity):
             return
         message, stamp = work.args[0], info['source_timestamp']
         now = pool.now
+        if engine.record is not None or self.source >= 0 or self.remote_publishers:
+            now = pool.tick()  # the message may have been sent after the turn began
         if engine.record is not None:
-            now = pool.tick()  # it becomes ready right after it was taken
             engine.taken(
                 self, message, stamp, info.get('publication_sequence_number'), now)
         if self.callback is None:
@@ -296,7 +297,9 @@ class ServiceEntity(ArrivalEntity):
         service, pool = self.rclpy, self.rooms.pool
         engine = pool.engine
         # a recording tells requests apart by the time at which they became ready
-        now = pool.now if engine.record is None else pool.tick()
+        now = pool.now
+        if engine.record is not None or self.source >= 0:
+            now = pool.tick()
         work = Work(
             self, service.callback, (request, service.srv_type.Response()),
             partial(service.send_response, header=header))

@@ -336,9 +336,10 @@ class WorkerPool:
         """Report a timer that is due to the engine; the caller holds the lock."""
         work, due, missed, period = fired
         due += self._offset
-        self.engine.timer_due(work, due, self.now)
+        now = self.tick()   # it may have become due since the turn began
+        self.engine.timer_due(work, due, now)
         if missed:
-            self.engine.timer_missed(work.entity, due, period, missed, self.now)
+            self.engine.timer_missed(work.entity, due, period, missed, now)
 
     def report(self, event: Callable[..., None], *args: Any) -> None:
         """Report an event to a method of the engine, and wake a thread for ready executions."""

@@ -315,6 +315,39 @@ def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_n
     assert statistics['dags']['ticks']['jobs'] >= round((last - first) / 1e7) + 1
 
 
+@pytest.mark.parametrize('records', [False, True])
+def test_a_release_is_the_due_time_even_if_that_was_after_the_turn_began(
+        make_executor, make_node, records, tmp_path):
+    """A thread may lose its processor between its wake-up and the next timer."""
+    node, releases, first, second = make_node(), {}, [], []
+
+    def one():
+        first.append(1)
+
+    def two():
+        second.append(1)
+
+    node.create_timer(0.01, one)
+    time.sleep(0.005)
+    node.create_timer(0.01, two)
+    executor = make_executor(
+        loads(graph(node="""
+            name: one, timer: 10ms, dag: a, deadline: 10s
+            name: two, timer: 10ms, dag: b, deadline: 10s""")), nodes=[node],
+        trace=str(tmp_path / 'trace.mcap') if records else None)
+    executor._engine.verdicts.on_release = (
+        lambda dag, release: releases.setdefault(dag, []).append(release))
+    handle = executor._pool.due.handle
+    executor._pool.due.handle = lambda *each: (time.sleep(0.012), handle(*each))
+    with Spinning(executor):
+        assert wait_for(lambda: len(first) >= 10 and len(second) >= 10)
+    assert len(releases) == 2
+    for each in releases.values():
+        grid = each[len(each) // 2]
+        # the first one is released when the executor begins to manage the timer
+        assert all(min((at - grid) % (10 * MS), (grid - at) % (10 * MS)) < MS for at in each[1:])
+
+
 @pytest.mark.parametrize('stamp', ['source_timestamp', 'header_stamp'])
 def test_a_message_from_before_the_spin_is_released_when_it_begins(
         make_executor, make_node, stamp):
