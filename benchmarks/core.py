@@ -16,8 +16,8 @@ from benchmarks import arguments
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress, table
-from mddag_executor.core import POLICIES
 from mddag_executor.errors import UsageError
+from mddag_executor.simulate import ALL_POLICIES
 
 HELP = 'measure the scheduler core'
 DESCRIPTION = 'Measure the core in plain Python: CPU time for each event and each job of a vertex.'
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_graph(parser)
     options.add(parser, '--workers', '--duration', '--seed', '--json')
     parser.add_argument(
-        '--policies', default=','.join(POLICIES), metavar='P,P…', help='(default: all)')
+        '--policies', default=','.join(ALL_POLICIES), metavar='P,P…', help='(default: all)')
     arguments.add_repeat(parser, 5)
 
 

@@ -27,6 +27,7 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.core import Scheduler, Tables
+from mddag_executor.core.policies import POLICIES as LIVE_POLICIES
 from mddag_executor.core.state import IDLE
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.evaluate import evaluate
@@ -110,7 +111,8 @@ def time_core(
 
     :param duration_ns: of virtual time.
     :param seed: of the execution times.
-    :return: for JSON: counts, and us of CPU time for each event and vertex job.
+    :return: for JSON: counts, and us of CPU time for each event and vertex job, in live calls only
+        under policies that live runs can have.
     :raises mddag_executor.core.PolicyError: if there is no such policy.
     :raises InputError: if a callback declares no execution time.
     """
@@ -126,8 +128,10 @@ def time_core(
     events = len(log) + len(load.times)
     taken = _seconds(simulate, repeat)
     legs = Tables.build(task_set, legs=True)
-    live_jobs = drive_live(legs, policy, load)
-    live = _seconds(lambda: drive_live(legs, policy, load), repeat)
+    live, live_jobs = 0.0, 0
+    if policy in LIVE_POLICIES:
+        live_jobs = drive_live(legs, policy, load)
+        live = _seconds(lambda: drive_live(legs, policy, load), repeat)
     return {
         'policy': policy, 'preemptive': settings.preempts, 'vertex_jobs': vertex_jobs,
         'events': events, 'repeat': repeat, 'us_per_event': _us(taken, events),

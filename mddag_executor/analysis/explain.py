@@ -39,7 +39,8 @@ from mddag_executor.analysis.chains import Chains, LINKS
 from mddag_executor.analysis.deadlines import Judged
 from mddag_executor.analysis.spans import crowded, Spans
 from mddag_executor.analysis.usage import in_groups, ran
-from mddag_executor.core import legs_of, POLICIES
+from mddag_executor.core import legs_of
+from mddag_executor.core.policies import SIMULATED_ONLY
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
@@ -71,10 +72,9 @@ class Explanation:
         # without misses there is nothing to explain
         self._executions = recording.executions[:None if len(judged.missed) else 0]
         self._rows = ran(self._executions)
-        policy = POLICIES.get(recording.head.policy)
         # with several processes it is unknown whose workers were busy
         self._workers = recording.head.workers if recording.declared and \
-            recording.processes == 1 and not (policy is not None and policy.polling) else 0
+            recording.processes == 1 and recording.head.policy not in SIMULATED_ONLY else 0
         # where callbacks may delay each other: of another executor it is not known which threads
         # share its work
         self._place = self._executions['worker' if recording.imported else 'process'].astype(

@@ -20,7 +20,7 @@ from mddag_executor import defaults
 from mddag_executor.cli import common, options
 from mddag_executor.cli.main import EXIT_INTERRUPTED
 from mddag_executor.cli.text import Cell, Progress, table, warn
-from mddag_executor.core import POLICIES
+from mddag_executor.core.policies import POLICIES, SIMULATED_ONLY
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.text import counted
 
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='number of the first run: results of ranges that do not overlap can be merged by '
         'adding their counts (default: 0)')
     add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',
-        help=f'any of {", ".join(POLICIES)} (default: %(default)s)')
+        help=f'any of {", ".join((*POLICIES, *SIMULATED_ONLY))} (default: %(default)s)')
     add('--execution-times', metavar='FILE.npz', type=options.Input,
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')

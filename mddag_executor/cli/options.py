@@ -88,7 +88,7 @@ def list_of(kind: Callable[[str], T]) -> Callable[[str], list[T]]:
 
 def policies(text: str) -> tuple[str, ...]:
     """Return the policies that `--policies` names."""
-    from mddag_executor.core import policy
+    from mddag_executor.simulate.policies import policy
     names = [name.strip() for name in text.split(',')]
     for i, name in enumerate(names):
         policy(name)
@@ -223,10 +223,22 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
 
 
 def _policy() -> dict[str, Any]:
+    from mddag_executor.core.policies import POLICIES, SIMULATED_ONLY
+    return {
+        'type': _simulated_policy, 'default': 'rad', 'metavar': 'P',
+        'help': f'one of {", ".join((*POLICIES, *SIMULATED_ONLY))}', 'otherwise': 'rad'}
+
+
+def _simulated_policy(text: str) -> str:
+    from mddag_executor.simulate.policies import policy
+    return policy(text).name
+
+
+def live_policy() -> dict[str, Any]:
+    """Return how `--policy` of verbs that run callbacks differs: some are simulated only."""
     from mddag_executor.core import POLICIES, policy
     return {
-        'type': lambda text: policy(text).name, 'default': 'rad', 'metavar': 'P',
-        'help': f'one of {", ".join(POLICIES)}', 'otherwise': 'rad'}
+        'type': lambda text: policy(text).name, 'help': f'one of {", ".join(POLICIES)}'}
 
 
 def _on_late() -> dict[str, Any]:

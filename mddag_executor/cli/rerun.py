@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='how long callbacks take: recorded (the default for a trace), declared (the default '
         'for a bag), or a file: a trace, or JSON with execution times')
     options.add(parser, '--cpus', otherwise='as many as are needed')
-    options.add(parser, '--policy')
+    options.add(parser, '--policy', **options.live_policy())
     options.add(parser, '--seed',
                 help="seed of Python's and numpy's random numbers and of declared times")
     add('--all-clocks', action='store_true',

@@ -85,7 +85,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--concurrent', metavar='NAME', action='append', default=[],
         help='let the callbacks of this node overlap with others of its program, even if the '
         'program spins in a single thread; repeat it for more nodes')
-    options.add(parser, '--policy', '--workers', '--fail-on-miss')
+    options.add(parser, '--policy', **options.live_policy())
+    options.add(parser, '--workers', '--fail-on-miss')
     options.add(parser, '--on-late', default='demote')
     add('--diagnostics', type=_or_off, default='1s', metavar='TIME',
         help="how often to publish the executor's state on /diagnostics, for mddag top and other "

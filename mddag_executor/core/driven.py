@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Which execution completes a sync of topics with different rates (``driven_by``): rule 16.
+Which execution completes a sync of topics with different rates (``driven_by``): rule 14.
 
 Theory of operation
 -------------------

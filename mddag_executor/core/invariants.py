@@ -26,7 +26,6 @@ from mddag_executor.core.state import (
     RUNNING,
     State,
     SUSPENDED,
-    UNPOLLED,
     WAITING,
 )
 from mddag_executor.core.tables import NEVER, Tables
@@ -48,7 +47,6 @@ def broken_invariants(t: Tables, s: State) -> Iterator[str]:
 def _all_heaps(s: State) -> Iterator[tuple[str, int, list[QueueEntry]]]:
     yield 'the ready heap', READY, s.ready
     yield 'what is held back', HELD_BACK, s.held_back
-    yield 'what waits for a poll', UNPOLLED, s.unpolled
     for group, heap in enumerate(s.group_heap):
         yield f'the heap of group {group}', group, heap
     for outer, heap in enumerate(s.outer_heap):
@@ -61,7 +59,7 @@ def _heaps(s: State) -> Iterator[str]:
     for name, at, heap in _all_heaps(s):
         for place, entry in enumerate(heap):
             what = entry[4]
-            if at != UNPOLLED and place > 0 and heap[(place - 1) // 2] > entry:
+            if place > 0 and heap[(place - 1) // 2] > entry:
                 yield f'{name} is not a heap at its place {place}'
             if what in found:
                 yield f'{name} has a second entry of {what}'

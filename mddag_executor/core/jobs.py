@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Jobs as a whole: rules 1, 6 to 8 and 10 of the scheduling rules, which ``rules`` lists.
+Jobs as a whole: rules 1, 6 to 8 and 9 of the scheduling rules, which ``rules`` lists.
 
 Jobs are opened, judged and ended here, and their slots recycled.  Like ``rules`` this module
 contains only integer arithmetic and list indexing.
@@ -83,7 +83,7 @@ def source_depth(t: Tables, s: State, dag: int) -> int:
     """
     Return how many releases of a timer source may wait: as many as can be in time.
 
-    If its executions drop older ones, the last release may do so before it counts (rule 13).
+    If its executions drop older ones, the last release may do so before it counts (rule 11).
     """
     drops = t.keep[t.source[dag]] == KEEP_NEWEST or demotes(t, s, dag)
     return max(1, -(-t.dag_deadline[dag] // t.period[dag])) + int(drops)
@@ -91,7 +91,7 @@ def source_depth(t: Tables, s: State, dag: int) -> int:
 
 def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:
     """
-    Set which vertices of a DAG are expected here (rule 10), for the jobs released from now on.
+    Set which vertices of a DAG are expected here (rule 9), for the jobs released from now on.
 
     :param here: by local index, 1 for a vertex that runs here and 0 for one that does not.
     """
@@ -109,7 +109,7 @@ def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:
 
 
 def _leave_out(t: Tables, s: State, slot: int) -> None:
-    """Leave out of a new job what is not expected here, as if it had completed (rule 10)."""
+    """Leave out of a new job what is not expected here, as if it had completed (rule 9)."""
     dag = s.job_dag[slot]
     for vertex in range(t.first_vertex[dag], t.first_vertex[dag + 1]):
         if s.expected[vertex] == ELSEWHERE:
@@ -201,7 +201,7 @@ def give_up(t: Tables, s: State, slot: int, end: int, now: int) -> None:
     """
     End an open job early: each sink that has not completed is missed.
 
-    :param end: EXPIRED (rules 1 and 8), FAILED (rule 8), or OUTDATED (rule 13).
+    :param end: EXPIRED (rules 1 and 8), FAILED (rule 8), or OUTDATED (rule 11).
     """
     judge_incomplete(t, s, slot, SINK_ABORTED + end - ABORTED, -NEVER, NEVER)
     close_job(s, slot, end, now)
@@ -229,7 +229,7 @@ def judge_incomplete(
 
 
 def is_due(t: Tables, s: State, slot: int, vertex: int) -> bool:
-    """Return whether a sink is known to be due: all its gates were opened (rule 15)."""
+    """Return whether a sink is known to be due: all its gates were opened (rule 13)."""
     for i in range(t.first_gate[vertex], t.first_gate[vertex + 1]):
         if s.x_state[s.job_base[slot] + t.gates[i]] == IDLE:
             return False
@@ -246,7 +246,7 @@ def finish(t: Tables, s: State, now: int) -> None:
 
 
 def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
-    """Drop a sink of an open job that has not started when the next job's is ready (rule 13)."""
+    """Drop a sink of an open job that has not started when the next job's is ready (rule 11)."""
     head = s.job_base[slot] + t.region_offset[vertex]
     if s.x_pending[head] < 0:
         return
@@ -260,10 +260,10 @@ def outdate_sink(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
 
 def withhold_from(t: Tables, s: State, slot: int, by: int, vertex: int, now: int) -> None:
     """
-    Note that an execution which is about to end has not published what starts a vertex (rule 15).
+    Note that an execution which is about to end has not published what starts a vertex (rule 13).
 
     The vertex is not due in the job, nor in those in which the publishing vertex completes with
-    this job's (rule 16).  A driver calls this before it reports the end of the execution.
+    this job's (rule 14).  A driver calls this before it reports the end of the execution.
     """
     older = s.job_previous[slot]
     withhold(t, s, slot, vertex, now)
@@ -277,7 +277,7 @@ def withhold_from(t: Tables, s: State, slot: int, by: int, vertex: int, now: int
 
 def withhold(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
     """
-    Note that no message starts a vertex of an open job (rule 15).
+    Note that no message starts a vertex of an open job (rule 13).
 
     The vertex and all after it are not due in this job: a sync among them lacks a leg for good.
     """
@@ -307,7 +307,7 @@ def due_of_answer(t: Tables, s: State, vertex: int, now: int) -> int:
     Return the reference absolute deadline of an execution that may complete a driven sync.
 
     It is that of the earliest job whose vertex it may complete in time, or else of the next job
-    (rule 16).
+    (rule 14).
     """
     dag = t.dag_of[vertex]
     slot = s.oldest[dag]

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Late queues and importance: rules 7 and 14 of the scheduling rules, which ``rules`` lists.
+Late queues and importance: rules 7 and 12 of the scheduling rules, which ``rules`` lists.
 
 What comes first is checked (``demote``) after ``State.start_by`` of its vertex.  That is the
 latest start with which all its sinks are in time, or the past if the vertex gives way to more
@@ -74,7 +74,7 @@ def _priority_in_time(t: Tables, s: State, x: int, now: int) -> int:
     vertex = s.x_vertex[x]
     if vertex == t.n_vertices:
         return NEVER  # it is not known how long they take
-    process = _process(t, s, vertex)
+    process = s.process[vertex]
     yields = _still_gives_way(t, s, vertex, now)
     begin = now
     if s.x_started[x] >= 0:  # it was preempted
@@ -183,24 +183,19 @@ def set_start(t: Tables, s: State, vertex: int) -> None:
 
 def admit(t: Tables, s: State) -> None:
     """
-    Set which importance gives way in each process (rule 14), and whether the rest is too much.
+    Set which importance gives way in each process (rule 12), and whether the rest is too much.
 
     A driver calls this at the begin and when the execution times have changed.
     """
     changed = False
     for process in range(1, len(s.overtaking)):
-        workers = len(s.worker_x)
-        if len(s.pool) > 0:
-            workers = 0
-            for worker in range(len(s.pool)):
-                workers += int(s.pool[worker] == process)
         below = s.late_importance[process]
         s.overloaded[process] = 1
         for importance in range(IMPORTANT + 1):
             demand, held = _demand(t, s, process, importance)
             if demand > 0 and importance > below:
                 below = importance
-            if demand <= workers * PPM and held <= PPM:
+            if demand <= s.n_workers[process] * PPM and held <= PPM:
                 s.overloaded[process] = int(importance > below)
                 break
         changed = changed or below != s.demoted_below[process]
@@ -216,7 +211,7 @@ def _demand(t: Tables, s: State, process: int, importance: int) -> tuple[int, in
     held = 0
     for v in range(t.n_vertices):
         if (t.importance[v] >= importance and s.expected[v] != ELSEWHERE
-                and (len(s.pool) == 0 or t.process[v] == process)):
+                and s.process[v] == process):
             share = s.mean[v] * PPM // t.period[t.dag_of[v]]
             demand += share
             if s.holder[v] != 0:
@@ -225,29 +220,25 @@ def _demand(t: Tables, s: State, process: int, importance: int) -> tuple[int, in
 
 
 def gives_way(t: Tables, s: State, vertex: int) -> bool:
-    """Return whether all jobs are demoted at a vertex, for more important ones (rule 14)."""
-    return (t.importance[vertex] < s.demoted_below[_process(t, s, vertex)]
+    """Return whether all jobs are demoted at a vertex, for more important ones (rule 12)."""
+    return (t.importance[vertex] < s.demoted_below[s.process[vertex]]
             and demotes(t, s, t.dag_of[vertex]))
 
 
 def _still_gives_way(t: Tables, s: State, vertex: int, now: int) -> bool:
     """Return whether a vertex gives way now: to a late sink it does only for a while."""
-    process = _process(t, s, vertex)
+    process = s.process[vertex]
     if now > s.late_until[process] and s.late_importance[process] > 0:
         s.late_importance[process] = 0
         admit(t, s)
     return gives_way(t, s, vertex)
 
 
-def _process(t: Tables, s: State, vertex: int) -> int:
-    return 1 if len(s.pool) == 0 else t.process[vertex]
-
-
 def note_late(t: Tables, s: State, sink: int, now: int) -> None:
-    """Note that a sink is late: less important work gives way to it for a while (rule 14)."""
+    """Note that a sink is late: less important work gives way to it for a while (rule 12)."""
     if not demotes(t, s, t.dag_of[sink]) or gives_way(t, s, sink):
         return  # late jobs of the DAG are not demoted, or it must itself give way
-    process = _process(t, s, sink)
+    process = s.process[sink]
     if t.importance[sink] >= s.late_importance[process]:
         s.late_until[process] = now + LATE_PATIENCE * t.sink_deadline[sink]
     if t.importance[sink] > s.late_importance[process]:

@@ -16,7 +16,7 @@ directly by the live executor.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from mddag_executor.core.state import DAG_KEYS, DEADLINE_KEYS, OTHER_KEYS, START_KEYS
@@ -57,20 +57,6 @@ def key_dm(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     return (t.rad_offset[v], job, order, 0)
 
 
-def key_ros2(t: Tables, v: int, release: int, job: int, order: int) -> Key:
-    """
-    Return the key of rclcpp's executor within a polling round: the index in the wait set.
-
-    Timers come first, then subscriptions, services and clients, each in order of registration,
-    which is that of the declaration (rclpy visits them node by node).  The polling rounds of this
-    executor are rule 9 of ``rules``.  Source: D. Casini et al., "Response-Time Analysis of ROS 2
-    Processing Chains Under Reservation-Based Scheduling", ECRTS 2019; for several workers X. Jiang
-    et al., "Real-Time Scheduling and Analysis of Processing Chains on Multi-Threaded Executor in
-    ROS 2", RTSS 2022; and rclcpp of Jazzy, which checks timers, too, only when it polls.
-    """
-    return (t.entity[v], order, 0, 0)
-
-
 def key_picas(t: Tables, v: int, release: int, job: int, order: int) -> Key:
     """
     Return the key of PiCAS: the fixed priority of the callback, then order of becoming ready.
@@ -91,34 +77,15 @@ class Policy(NamedTuple):
     A row of the policy table.
 
     ``preemptive``: whether the paper's experiment runs the policy with preemption; an executor of
-    callbacks cannot preempt and ignores it.  ``polling``: whether it works in rounds (rule 9 of
-    ``rules``).  ``urgency``: which time the keys are, if any (rule 7).
+    callbacks cannot preempt and ignores it.  ``urgency``: which time the keys are, if any (rule 7
+    of ``rules``).
     """
 
     name: str
     key: KeyFunction
     preemptive: bool
     meaning: str
-    polling: bool = False
     urgency: int = OTHER_KEYS
-
-    def mode(self, preemptive: bool | None, processes: int = 1) -> bool:
-        """
-        Return whether to preempt: as requested, else the default of the policy.
-
-        :raises PolicyError: when the policy does not support preemption, or not with so many
-            processes (rule 12).
-        """
-        if processes > 1 and (preemptive or self.polling):
-            what = 'polling' if self.polling else 'preemption'
-            raise PolicyError(
-                f"policy '{self.name}': {what} is known of one process only: give "
-                f"{'another policy' if self.polling else 'no preemption'}, or one process")
-        if preemptive and self.polling:
-            raise PolicyError(
-                f"policy '{self.name}': an executor that polls preempts no callback: "
-                'run it without preemption')
-        return self.preemptive if preemptive is None else preemptive
 
 
 POLICIES: dict[str, Policy] = {p.name: p for p in (
@@ -131,9 +98,12 @@ POLICIES: dict[str, Policy] = {p.name: p for p in (
     Policy('dm', key_dm, True, 'deadline monotonic: the shortest relative deadline first'),
     Policy('llf', key_llf, True, 'least laxity first: deadline less the critical path to it',
            urgency=START_KEYS),
-    Policy('ros2', key_ros2, False, "rclcpp's executor: wait-set order by polling rounds", True),
     Policy('picas', key_picas, False, 'chain-aware fixed priorities (PiCAS)'),
 )}
+
+
+SIMULATED_ONLY = ('ros2',)
+"""Policies that only simulation knows (``simulate.policies``)."""
 
 
 class PolicyError(MddagError):
@@ -142,9 +112,14 @@ class PolicyError(MddagError):
 
 def policy(name: str) -> Policy:
     """Return the policy with this name, or raise PolicyError."""
+    return find(name, POLICIES)
+
+
+def find(name: str, policies: Mapping[str, Policy]) -> Policy:
+    """Return the policy with this name of a table, or raise PolicyError."""
     try:
-        return POLICIES[name]
+        return policies[name]
     except (KeyError, TypeError):  # a list, for example
+        what = 'only simulations know it' if name in SIMULATED_ONLY else 'there is no such policy'
         raise PolicyError(
-            f"policy '{name}': there is no such policy: choose one of {', '.join(POLICIES)}"
-        ) from None
+            f"policy '{name}': {what}: choose one of {', '.join(policies)}") from None

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The queues in which executions wait: rules 3, 4, 9, 11 and 12 (see ``rules``).
+The queues in which executions wait: rules 3, 4 and 10 (see ``rules``).
 
 Theory of operation
 -------------------
@@ -23,17 +23,10 @@ Each entry is in exactly one of
 * the heap of a callback group (``State.group_heap``), if the group was busy when it came first;
 * the heap of an outer group (``State.outer_heap``), if that had no place when it came first;
 * the heap of what is deferred (``State.held_back``), if an execution as urgent held the
-interpreter when it came first, or no worker of its process was idle;
-* under a policy that polls, the list of what waits for a poll (``State.unpolled``).
+interpreter when it came first.
 
 An entry whose key changes is replaced where it is, so no heap has an outdated one.  It nearly
 always is the first one; for any other the heap is searched, which is rare.
-
-**Polling rounds** (rule 9).  Between two polls the ready heap is the result of the last one; what
-becomes ready waits for the next one.  Of each *entity*, as in the wait set of rclpy and rclcpp (a
-timer, or a subscription with its waiting messages), ``poll`` takes the first execution, so each
-entity runs at most once in a round.  Vertices of one callback are one entity; undeclared queues
-and executions are an entity each.
 """
 
 from __future__ import annotations
@@ -47,15 +40,13 @@ from mddag_executor.core.state import (
     NO_PLACE,
     OUTER,
     PLACED,
-    POLLING,
     QueueEntry,
     READY,
     RETURNS,
     State,
-    UNPOLLED,
     WAITING,
 )
-from mddag_executor.core.tables import NEVER, Tables
+from mddag_executor.core.tables import Tables
 
 TURN_NS = 1_000_000
 """No overtaking if the holder needs less time than this: Python switches threads no sooner."""
@@ -73,10 +64,7 @@ def enqueue(t: Tables, s: State, x: int) -> None:
     if before < 0:
         s.queue_first[queue] = s.queue_last[queue] = x
         s.queue_key[queue] = entry
-        if s.scalars[POLLING] == 0:  # not put(): a call less for each execution
-            heappush(s.ready, entry)
-        else:
-            wait_for_poll(s, entry)
+        heappush(s.ready, entry)
         return
     after = -1
     while before >= 0 and entry < s.x_key[before]:
@@ -114,10 +102,7 @@ def put(s: State, entry: QueueEntry) -> None:
     """Add the entry of a queue that had none."""
     queue = entry[4]
     s.queue_key[queue] = entry
-    if s.scalars[POLLING] == 0:
-        heappush(s.ready, entry)
-    else:
-        wait_for_poll(s, entry)
+    heappush(s.ready, entry)
 
 
 def unlink(s: State, x: int) -> None:
@@ -125,7 +110,6 @@ def unlink(s: State, x: int) -> None:
     if s.x_state[x] == ALONE:
         remove(s.ready, ~x)
         remove(s.held_back, ~x)
-        remove(s.unpolled, ~x)
         if s.x_group[x] >= 0:
             remove(s.group_heap[s.x_group[x]], ~x)
         if s.x_outer[x] >= 0:
@@ -139,27 +123,25 @@ def unlink(s: State, x: int) -> None:
         remove(heap_at(s, s.queue_place[queue]), queue)
         s.queue_place[queue] = READY
         s.queue_demoted[queue] = -1
-    elif is_first and s.queue_place[queue] != READY and s.queue_place[queue] != UNPOLLED:
+    elif is_first and s.queue_place[queue] != READY:
         # the next one may be of another group, or not need the interpreter
         change_key(s, queue, s.queue_key[queue])
 
 
 def heap_at(s: State, place: int) -> list[QueueEntry]:
-    """Return the heap, or the list of what waits for a poll, at a place."""
+    """Return the heap at a place."""
     if place >= 0:
         return s.group_heap[place]
     if place <= OUTER:
         return s.outer_heap[OUTER - place]
-    if place == HELD_BACK:
-        return s.held_back
-    return s.unpolled if place == UNPOLLED else s.ready
+    return s.held_back if place == HELD_BACK else s.ready
 
 
 def change_key(s: State, queue: int, entry: QueueEntry) -> None:
     """Replace the entry of a queue, and let it come forward: its first execution may be new."""
     heap = heap_at(s, s.queue_place[queue])
     s.queue_key[queue] = entry
-    if s.queue_place[queue] == READY or s.queue_place[queue] == UNPOLLED:
+    if s.queue_place[queue] == READY:
         heap[_place_of(heap, queue)] = entry
         heapify(heap)
     else:
@@ -260,53 +242,27 @@ def remove(heap: list[QueueEntry], what: int) -> bool:
     return place >= 0
 
 
-def next_heap(t: Tables, s: State, first: bool) -> list[QueueEntry]:
+def next_heap(s: State) -> list[QueueEntry]:
     """
     Return the heap whose first entry is dispatched first; empty if there is none.
 
-    What is deferred counts once it may start (rules 11 and 12).
-
-    :param first: nothing has been set aside since a resource became free.
+    A deferred execution counts once it may start (rule 10).
     """
-    if len(s.overtaking) > 2:
-        if first:
-            _bring_forward(t, s)
-        return s.ready
     if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
         return s.ready
-    return s.held_back if may_start(t, s, s.held_back[0]) else s.ready
+    return s.held_back if may_start(s, s.held_back[0]) else s.ready
 
 
-def _bring_forward(t: Tables, s: State) -> None:
-    """Move what is deferred, and may start now, into the ready heap."""
-    kept = 0
-    for i in range(len(s.held_back)):
-        entry = s.held_back[i]
-        if may_start(t, s, entry):
-            come_forward(s, entry)
-        else:
-            s.held_back[kept] = entry
-            kept += 1
-    del s.held_back[kept:]
-    heapify(s.held_back)
+def defer(s: State, heap: list[QueueEntry], deferred: list[QueueEntry]) -> None:
+    """Move the first entry of a heap to the heap of deferred ones."""
+    entry = heappop(heap)
+    if entry[4] >= 0:
+        s.queue_place[entry[4]] = HELD_BACK
+    heappush(deferred, entry)
 
 
-def idle_worker(t: Tables, s: State, x: int) -> int:
-    """Return the first idle worker, of its process if there are several; -1: there is none."""
-    process = t.process[s.x_vertex[x]]
-    for worker in range(len(s.worker_x)):
-        if s.worker_x[worker] < 0 and (len(s.pool) == 0 or s.pool[worker] == process):
-            return worker
-    return -1
-
-
-def may_start(t: Tables, s: State, entry: QueueEntry) -> bool:
-    """
-    Return whether what waits with an entry may start.
-
-    Its process must have an idle worker (rule 12), and no execution that is as urgent or more may
-    hold the interpreter that it needs (rule 11).
-    """
+def may_start(s: State, entry: QueueEntry) -> bool:
+    """Return whether no execution that is as urgent or more holds its interpreter (rule 10)."""
     interpreter = s.x_holds[first_of(s, entry)]
     if interpreter != 0 and s.scalars[N_HOLDING] > 0:
         for worker in range(len(s.worker_x)):
@@ -314,33 +270,29 @@ def may_start(t: Tables, s: State, entry: QueueEntry) -> bool:
             if (x >= 0 and s.x_holds[x] == interpreter
                     and (s.overtaking[interpreter] == 0 or s.x_key[x][0] <= entry[0])):
                 return False
-    return len(s.pool) == 0 or idle_worker(t, s, first_of(s, entry)) >= 0
+    return True
 
 
-def first_waiting(t: Tables, s: State, process: int) -> int:
-    """Return the first waiting execution of all, or of one process if there are several."""
-    first = -1
-    smallest = (NEVER, 0, 0, 0, 0)
-    for heap in (s.ready, s.held_back):
-        for i in range(len(heap) if len(s.overtaking) > 2 else min(1, len(heap))):
-            if heap[i] < smallest:
-                x = first_of(s, heap[i])
-                if len(s.overtaking) == 2 or t.process[s.x_vertex[x]] == process:
-                    first = x
-                    smallest = heap[i]
-    return first
+def first_waiting(s: State) -> int:
+    """Return the first waiting execution; -1: there is none."""
+    if len(s.ready) == 0 and len(s.held_back) == 0:
+        return -1
+    if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
+        return first_of(s, s.ready[0])
+    return first_of(s, s.held_back[0])
 
 
 def overtaking_pays(
-    t: Tables, s: State, process: int, held: int, usual: int, preempts: bool
+    t: Tables, s: State, first: int, held: int, usual: int, preempts: bool
 ) -> bool:
     """
-    Return whether the first waiting execution may overtake a holder of its interpreter (rule 11).
+    Return whether the first waiting execution may overtake a holder of its interpreter (rule 10).
 
     The two would share the interpreter, which slows both down.  So the waiting execution is
     deferred if its wait is short compared with its relative deadline (RAD minus release).  (Not
     compared with the rest of that: if all are late, all would overtake.)
 
+    :param first: that execution; -1: there is none.
     :param held: how long the holder has held the interpreter; ``usual``: its usual duration, ns.
     :param preempts: whether the holder would pause meanwhile, so that the two share nothing.
     """
@@ -348,49 +300,12 @@ def overtaking_pays(
     left = abs(usual - held)
     if left < TURN_NS or preempts:
         return left >= TURN_NS
-    first = first_waiting(t, s, process)
     return first < 0 or PATIENCE * left >= t.rad_offset[s.x_vertex[first]]
 
 
 def overtaking_pays_from(
-    t: Tables, s: State, process: int, usual: int, preempts: bool
+    t: Tables, s: State, first: int, usual: int, preempts: bool
 ) -> int:
     """Return after which time of holding the interpreter overtaking pays again, ns."""
-    first = -1 if preempts else first_waiting(t, s, process)
-    wait = 0 if first < 0 else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
+    wait = 0 if first < 0 or preempts else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
     return usual + max(TURN_NS, wait)
-
-
-def wait_for_poll(s: State, entry: QueueEntry) -> None:
-    """Let an entry wait for the next poll (rule 9)."""
-    if entry[4] >= 0:
-        s.queue_place[entry[4]] = UNPOLLED
-    s.unpolled.append(entry)
-
-
-def poll(t: Tables, s: State) -> None:
-    """Begin a round: move the first of every entity to the ready heap, which is empty."""
-    for i in range(len(s.unpolled)):
-        entity = _entity(t, s.unpolled[i])
-        if entity >= 0:
-            s.first_order[entity] = min(s.first_order[entity], s.unpolled[i][1])
-    kept = 0
-    for i in range(len(s.unpolled)):
-        entry = s.unpolled[i]
-        entity = _entity(t, entry)
-        if entity < 0 or entry[1] == s.first_order[entity]:
-            come_forward(s, entry)
-        else:
-            s.unpolled[kept] = entry
-            kept += 1
-    del s.unpolled[kept:]
-    for entity in range(len(s.first_order)):
-        s.first_order[entity] = NEVER
-
-
-def _entity(t: Tables, entry: QueueEntry) -> int:
-    """Return the entity of what waits for a poll, -1: its own; each topic of a sync is one."""
-    queue = entry[4]
-    if queue < 0 or queue >= len(t.leg_topic):
-        return -1
-    return entry[0] + t.leg_topic[queue]

@@ -37,11 +37,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     its outer group has no place is set aside in that group's heap.  An execution has a place while
     it runs, but not while it is suspended, nor, if only one may run, while it has lent its worker:
     it asks for one again, also of a closed group.
-5.  **Workers.**  A fresh execution goes to the idle worker with the lowest number (``schedule``),
-    or to the worker that asks (``take``: live, cache-warm).  If no worker is idle and preemption
-    is on, the running execution with the largest priority (ties: the highest worker number) is put
-    back, if its priority is strictly larger than the smallest waiting one.  Migration is free;
-    overheads are added to the remaining execution time.
+5.  **Workers.**  The execution that comes first goes to an idle worker (``take``), which the
+    driver chooses.  Simulated workers may also be preempted, poll, or belong to several processes:
+    see ``simulate.dispatch``.
 6.  **Verdicts.**  A sink that completes after its absolute deadline (release plus relative
     deadline) is late; at the deadline it is in time.  ``finish`` judges open jobs at the end of
     the run: an absolute deadline at or before the end was missed.  Each sink of a job gets one
@@ -58,7 +56,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     the queue goes by the first one that can, and by the earliest deadline that this can meet, so
     a backlog is worked off.  In a lasting overload (``State.overloaded``) the mean execution times
     of those before it also count.  Age and place belong to the queue: if an execution is dropped
-    (rule 13, or live a full queue), the queue keeps the place that the dropped one had, or is as
+    (rule 11, or live a full queue), the queue keeps the place that the dropped one had, or is as
     late as it.  A preempted execution is checked by itself.  Running executions keep their keys.
     Only policies whose keys are times demote.  Of undeclared callbacks it is not known how long
     they take: their queue is late when its first execution is past its deadline, and remains so
@@ -70,16 +68,11 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     which is never lost silently), but make no further edge true and are not judged.  Later
     failures change nothing.  The slot is free when no execution of the job waits, runs or is
     suspended.
-9.  **Polling.**  Under a policy that polls (``ros2``) the ready heap is the result of the last
-    poll.  When an idle worker finds it empty, it polls: the queue that comes first of every entity
-    (timer, subscription, …) forms the next round, with one execution.  What becomes ready later
-    waits for the next poll, as do queues whose group is busy when they come first.  There is no
-    preemption.
-10. **Several processes.**  If the callbacks of a DAG run in several processes (live), each process
+9.  **Several processes.**  If the callbacks of a DAG run in several processes (live), each process
     expects some of a job's vertices *here*.  The others count as done: they are not judged here
     and keep no job open.  A job ends when its sinks here have completed, and the vertices that
     *lead out*, to a vertex elsewhere: their messages belong to the job until they end.
-11. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
+10. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
     the interpreter (reported by the driver, ``State.x_holds``) starts only if no running execution
     with the same or a smaller priority holds it.  Until then its queue is deferred
     (``State.held_back``), and others overtake it.  If it is more urgent than all holders, it
@@ -88,26 +81,22 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     the interpreter with it.  An execution that lends its worker, is
     suspended or turns out to wait (``stop_holding``) holds it no more, and needs it and a worker
     again when it resumes.
-12. **Several processes in virtual time.**  One state can represent all processes of a run
-    (``state.divide``).  Each has its own workers and interpreter, for which rules 5 and 11 hold
-    separately; an execution without an idle worker in its process is deferred.  There is no
-    preemption and no polling then.
-13. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
+11. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
     one that has not started is dropped when that of a later job becomes ready.  So is a release of
     a timer that is late then (``KEEP_TIMELY``).  A job without its source is
     ``OUTDATED``; a dropped sink is not in time.
-14. **Importance.**  A vertex has the highest importance of the sinks that it leads to, over
+12. **Importance.**  A vertex has the highest importance of the sinks that it leads to, over
     trigger and queue edges.  While an important sink is late, or the known execution times demand
     more than the workers or the interpreter of a process can give, work of lower importance is
     demoted as if it were late (rule 7), and nothing more.  A sink counts as late for
     ``LATE_PATIENCE`` of its relative deadlines.  Of too much demand the least importance is
     demoted, as many levels as necessary, but never the highest.
-15. **Not due.**  A vertex may publish some of its topics only sometimes.  If it completes without
+13. **Not due.**  A vertex may publish some of its topics only sometimes.  If it completes without
     one of them, the vertices that the topic leads to, and all after these, are not due in the job
     (``withhold_from``): a sync needs all of its legs.  They get no verdict, and the job does not
     wait for them.  Until it is known that a sink is due it is not overdue (``is_due``); if its job
     expires or fails before, it is missed.  Sinks without a deadline are never judged.
-16. **Driven syncs.**  Of a sync with ``driven_by`` the message of one topic belongs to a job and
+14. **Driven syncs.**  Of a sync with ``driven_by`` the message of one topic belongs to a job and
     starts its vertex; those of the other topics start executions without a job.  Live, the vertex
     completes with the first execution that *answers* the job: see ``driven``.  In virtual time it
     completes with its execution, as any other.  An answer also completes the vertex in the older
@@ -141,29 +130,25 @@ from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
     call_next,
     come_forward,
+    defer,
     enqueue,
     has_place,
-    idle_worker,
     leave_outer,
     may_start,
     next_heap,
-    poll,
     put,
     unlink,
     wait_alone,
     wait_for_outer,
-    wait_for_poll,
 )
 from mddag_executor.core.state import (
     add_slot,
     ALONE,
     COMPLETED,
-    DISPATCH_OVERHEAD,
     DONE,
     DROP,
     DROPPED,
     FAILED,
-    HELD_BACK,
     IDLE,
     LATE,
     LEADS_OUT,
@@ -174,8 +159,6 @@ from mddag_executor.core.state import (
     ORDER,
     OUTDATED,
     PLACED,
-    POLLING,
-    PREEMPTIVE,
     PROPAGATE,
     QueueEntry,
     READY,
@@ -185,7 +168,6 @@ from mddag_executor.core.state import (
     SINK_LATE,
     State,
     SUSPENDED,
-    SWITCH_OVERHEAD,
     WAITING,
 )
 from mddag_executor.core.tables import AFTER_DRIVEN, DRIVEN, KEEP_ALL, KEEP_NEWEST, Tables
@@ -195,7 +177,6 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     """Let an execution wait in its queue (rule 3)."""
     slot = s.x_slot[x]
     s.job_active[slot] += 1
-    s.x_left[x] = s.x_cost[x]
     order = s.scalars[ORDER] = s.scalars[ORDER] + 1
     vertex = s.x_vertex[x]
     s.x_key[x] = key(
@@ -220,7 +201,7 @@ def _keep_newest(t: Tables, s: State, x: int, now: int) -> None:
 
 
 def _keep_timely(t: Tables, s: State, x: int, now: int) -> None:
-    """Drop the waiting releases of a timer before this one that are late (rule 13)."""
+    """Drop the waiting releases of a timer before this one that are late (rule 11)."""
     older = s.x_previous[x]
     while older >= 0:
         before = s.x_previous[older]
@@ -230,7 +211,7 @@ def _keep_timely(t: Tables, s: State, x: int, now: int) -> None:
 
 
 def _outdate(t: Tables, s: State, x: int, now: int) -> None:
-    """Drop a waiting execution for that of a newer job, and its job or sink with it (rule 13)."""
+    """Drop a waiting execution for that of a newer job, and its job or sink with it (rule 11)."""
     slot, vertex = s.x_slot[x], s.x_vertex[x]
     if s.job_state[slot] == OPEN:
         if is_late(t, s, x, now):
@@ -312,52 +293,39 @@ def peek(t: Tables, s: State, now: int) -> int:
     """
     Return the execution that is dispatched next, or -1 when none may run.
 
-    What cannot be next is set aside: if its group is busy in the group's heap (rule 4) or to the
-    next poll (rule 9), if it may not start with what is deferred (rules 11 and 12).  Late queues
-    are demoted (rule 7).
+    An execution that cannot be next is set aside: if its group is busy, in the heap of the group
+    (rule 4); if it may not hold the interpreter, with those that are deferred (rule 10).  Late
+    queues are demoted (rule 7).
     """
-    again = True
-    while True:
-        heap = s.ready
-        if s.held_back:
-            heap = next_heap(t, s, True)
-        while heap:
-            entry = heap[0]
-            x = s.queue_first[entry[4]] if entry[4] >= 0 else ~entry[4]
-            group = s.x_group[x]
-            if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
-                heappop(heap)
-                if s.scalars[POLLING] == 0:
-                    _wait_for_group(s, entry, group)
-                else:
-                    wait_for_poll(s, entry)
-                _let_others(s, x)
-            elif s.outer_limit and not has_place(s, x):
-                heappop(heap)
-                if s.x_aside[x] < 0 and s.outer_limit[s.x_outer[x]] > 0:
-                    s.x_aside[x] = now
-                if s.scalars[POLLING] == 0:
-                    wait_for_outer(s, entry, s.x_outer[x])
-                else:
-                    wait_for_poll(s, entry)
-                if group >= 0 and s.group_owner[group] == -1:
-                    _release_group(s, group)  # others of the group may be of another outer one
-            elif (now > s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]
-                    and demote(t, s, heap, x, now)):
-                if group >= 0 and s.group_owner[group] == -1:
-                    _release_group(s, group)  # others of the group may go first
-                _let_others(s, x)
-            elif ((s.pool or s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0)
-                    and not may_start(t, s, entry)):
-                _defer(s, heap, group)
-                _let_others(s, x)
-            else:
-                return x
-            heap = next_heap(t, s, False)
-        if not again or len(s.unpolled) == 0:
-            return -1
-        again = False  # a poll that finds only busy groups is the last
-        poll(t, s)
+    heap = s.ready
+    if s.held_back:
+        heap = next_heap(s)
+    while heap:
+        entry = heap[0]
+        x = s.queue_first[entry[4]] if entry[4] >= 0 else ~entry[4]
+        group = s.x_group[x]
+        if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
+            heappop(heap)
+            _wait_for_group(s, entry, group)
+            _let_others(s, x)
+        elif s.outer_limit and not has_place(s, x):
+            heappop(heap)
+            if s.x_aside[x] < 0 and s.outer_limit[s.x_outer[x]] > 0:
+                s.x_aside[x] = now
+            wait_for_outer(s, entry, s.x_outer[x])
+            let_group(s, x)  # others of the group may be of another outer one
+        elif (now > s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]
+                and demote(t, s, heap, x, now)):
+            let_group(s, x)  # others of the group may go first
+            _let_others(s, x)
+        elif s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0 and not may_start(s, entry):
+            defer(s, heap, s.held_back)
+            let_group(s, x)
+            _let_others(s, x)
+        else:
+            return x
+        heap = next_heap(s)
+    return -1
 
 
 def _wait_for_group(s: State, entry: QueueEntry, group: int) -> None:
@@ -367,12 +335,9 @@ def _wait_for_group(s: State, entry: QueueEntry, group: int) -> None:
     heappush(s.group_heap[group], entry)
 
 
-def _defer(s: State, heap: list[QueueEntry], group: int) -> None:
-    """Defer what comes first in a heap; others of its callback group may go first."""
-    entry = heappop(heap)
-    if entry[4] >= 0:
-        s.queue_place[entry[4]] = HELD_BACK
-    heappush(s.held_back, entry)
+def let_group(s: State, x: int) -> None:
+    """Let others of the callback group of an execution that cannot start yet go first."""
+    group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == -1:
         _release_group(s, group)
 
@@ -397,16 +362,10 @@ def _enter_outer(s: State, x: int, outer: int, now: int) -> None:
 
 
 def take(t: Tables, s: State, worker: int, now: int) -> int:
-    """
-    Dispatch the next execution and return it, or -1 (rule 5).
-
-    :param worker: an idle worker; -1: the one with the lowest number.
-    """
+    """Dispatch the next execution to an idle worker and return it, or -1 (rule 5)."""
     x = peek(t, s, now)
     if x < 0:
         return -1
-    if worker < 0:
-        worker = idle_worker(t, s, x)
     queue = s.x_queue[x] if s.x_state[x] == WAITING else ~x
     if s.ready and s.ready[0][4] == queue:
         s.x_key[x] = heappop(s.ready)
@@ -423,7 +382,6 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     s.x_state[x] = RUNNING
     s.x_worker[x] = worker
     s.x_started[x] = now
-    s.x_left[x] += s.scalars[DISPATCH_OVERHEAD]
     s.worker_x[worker] = x
     s.scalars[N_IDLE] -= 1
     if s.x_holds[x] != 0:
@@ -434,45 +392,6 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     if s.outer_limit and s.x_outer[x] >= 0:
         _enter_outer(s, x, s.x_outer[x], now)
     return x
-
-
-def schedule(t: Tables, s: State, key: KeyFunction, now: int) -> int:
-    """
-    Dispatch one execution (rule 5) and return it, or -1 when there is none to dispatch.
-
-    A driver calls this until it returns -1.
-    """
-    if s.scalars[N_IDLE] > 0:
-        return take(t, s, -1, now)
-    if s.scalars[POLLING] != 0:
-        return -1  # only an idle worker checks the queue, and polls
-    x = peek(t, s, now)
-    if x < 0 or s.scalars[PREEMPTIVE] == 0:
-        return -1
-    worker = 0
-    largest = s.x_key[s.worker_x[0]][0]
-    for w in range(1, len(s.worker_x)):
-        priority = s.x_key[s.worker_x[w]][0]
-        if priority >= largest:
-            worker, largest = w, priority
-    key_of_first = s.queue_key[s.x_queue[x]] if s.x_state[x] == WAITING else s.x_key[x]
-    if largest <= key_of_first[0]:
-        return -1
-    victim = s.worker_x[worker]
-    lend(s, victim)
-    x = take(t, s, worker, now)
-    _put_back(t, s, key, victim, now)
-    return x
-
-
-def _put_back(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
-    """Put a preempted execution back into the ready queue with its remaining time (rules 3, 5)."""
-    s.x_left[x] += s.scalars[SWITCH_OVERHEAD] - (now - s.x_started[x])
-    s.scalars[ORDER] += 1
-    slot = s.x_slot[x]
-    s.x_key[x] = key(
-        t, s.x_vertex[x], s.job_release[slot], s.job_index[slot], s.scalars[ORDER]) + (~x,)
-    wait_alone(s, x)
 
 
 def lend(s: State, x: int) -> None:
@@ -487,13 +406,8 @@ def lend(s: State, x: int) -> None:
         leave_outer(s, x)
 
 
-def progress(s: State, x: int, now: int) -> int:
-    """Return the elapsed execution time of a running execution, if its duration is known, ns."""
-    return s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
-
-
 def stop_holding(s: State, x: int) -> None:
-    """Release the interpreter for an execution that turns out not to hold it (rule 11)."""
+    """Release the interpreter for an execution that turns out not to hold it (rule 10)."""
     if s.x_worker[x] >= 0:
         s.scalars[N_HOLDING] -= int(s.x_holds[x] != 0)
     s.x_holds[x] = 0
@@ -610,7 +524,7 @@ def answer(
     t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, answered: int, now: int
 ) -> None:
     """
-    Complete a driven sync in an open job, live (rule 16).
+    Complete a driven sync in an open job, live (rule 14).
 
     :param answered: the slot of the job that an execution answers: this one, or a later one, which
         this one follows from now on.
@@ -627,7 +541,7 @@ def answer(
 def follow(
     t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, answered: int, now: int
 ) -> None:
-    """Let the vertices after a driven sync complete when they do in a later job (rule 16)."""
+    """Let the vertices after a driven sync complete when they do in a later job (rule 14)."""
     base, other = s.job_base[slot], s.job_base[answered]
     after = [vertex]
     while len(after) > 0:
@@ -664,7 +578,7 @@ def _release_group(s: State, group: int) -> None:
 def _complete_vertex(
     t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
 ) -> None:
-    """Complete a vertex in an open job, and in those that follow it there (rule 16)."""
+    """Complete a vertex in an open job, and in those that follow it there (rule 14)."""
     before = s.job_previous[slot]
     _complete_in(t, s, slot, vertex, now)
     if t.driven[vertex] >= AFTER_DRIVEN and s.scalars[PROPAGATE] == 0:

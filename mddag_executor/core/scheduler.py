@@ -52,7 +52,7 @@ class Scheduler:
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
         did not complete its vertex.
     :ivar fail: ``fail(x, now)`` ends a failed execution; see ``complete``.
-    :ivar answer: ``answer(slot, vertex, answered, now)`` completes a driven sync (rule 16).
+    :ivar answer: ``answer(slot, vertex, answered, now)`` completes a driven sync (rule 14).
     :ivar resume: ``resume(x, job, holds, now)`` makes a suspended execution ready to go on.
     :ivar rejoin: ``rejoin(x, job, holds, now)`` makes one that has lent its worker ready to go on.
 
@@ -65,8 +65,7 @@ class Scheduler:
         self.policy = policy(policy_name)
         state = empty(State)
         fill_state(
-            tables, state, n_workers, preemptive=0, propagate=0, dispatch_overhead=0,
-            switch_overhead=0, polling=int(self.policy.polling), urgency=self.policy.urgency)
+            tables, state, n_workers, propagate=0, urgency=self.policy.urgency)
         self.state = as_object(state)
         self._free_groups: list[int] = []
         self._free_queues: list[int] = []

@@ -31,12 +31,12 @@ FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # Columns of ``scalars``.  ``FORGET_AT``: until when no measured execution time is too old.
-(ORDER, N_IDLE, PREEMPTIVE, PROPAGATE, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLING,
- JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY, FORGET_AT, N_SCALARS) = range(14)
+(ORDER, N_IDLE, PROPAGATE, JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY, FORGET_AT,
+ N_SCALARS) = range(10)
 
 # Where the entry of a queue is (``queue_place``), if not in the heap of a callback group.
-READY, HELD_BACK, UNPOLLED = -1, -2, -3
-OUTER = -4  # the first outer group, the next one is -5, …
+READY, HELD_BACK = -1, -2
+OUTER = -3  # the first outer group, the next one is -4, …
 
 # Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
 # them, or deadlines of DAGs.
@@ -67,8 +67,8 @@ class State(NamedTuple):
 
     scalars: list[int]
     # heaps with an entry for each queue that is not empty, and each execution that waits alone:
-    # what may come first, what is deferred for the interpreter or a worker, and for each callback
-    # group what waits for it
+    # those that may come first, those that are deferred for the interpreter, and for each callback
+    # group those that wait for it
     ready: list[QueueEntry]
     held_back: list[QueueEntry]
     group_heap: list[list[QueueEntry]]
@@ -80,12 +80,11 @@ class State(NamedTuple):
     outer_running: list[int]
     outer_once: list[int]
     outer_wait: list[int]
-    # under a policy that polls: what waits for a poll, and by entity its first order, in a poll
-    unpolled: list[QueueEntry]
-    first_order: list[int]
-    # workers: the execution of each, and, if processes have separate pools, its process (from 1)
+    # the execution of each worker
     worker_x: list[int]
-    pool: list[int]
+    # by process, from 1: its number of workers; by vertex: its process, in a live run always 1
+    n_workers: list[int]
+    process: list[int]
     # by interpreter, from 1: whether a more urgent execution may overtake its holder
     overtaking: list[int]
     # the executions of undeclared callbacks that may be used again
@@ -157,7 +156,7 @@ class State(NamedTuple):
     x_cost: list[int]
     # of a sink: the last demoted job
     x_demoted: list[int]
-    # 1: it completes when it does in a later job (rule 16)
+    # 1: it completes when it does in a later job (rule 14)
     x_follows: list[int]
     # decisions that the driver has not fetched yet
     decisions: list[Decision]
@@ -183,29 +182,20 @@ def empty(kind: type[Kind]) -> Kind:
 
 
 def fill_state(
-    t: Tables, s: State, n_workers: int, preemptive: int, propagate: int, dispatch_overhead: int,
-    switch_overhead: int, polling: int, urgency: int,
+    t: Tables, s: State, n_workers: int, propagate: int, urgency: int
 ) -> None:
     """
     Fill the columns of an empty state.
 
-    :param preemptive: 1: a smaller key takes the worker of a larger one.
     :param propagate: 1: completions make the graph's edges true at once (simulation); 0: messages
         do, leg by leg, and the driver makes each leg ready (live); 2: messages do, and the driver
         reports each with ``rules.edge`` (rescheduling, with message latency).
-    :param dispatch_overhead: added to an execution each time it is dispatched, ns.
-    :param switch_overhead: added to an execution each time it is preempted, ns.
-    :param polling: 1: ready executions wait for a poll (see ``queues``); never with preemption.
     :param urgency: the kind of the policy's keys, ``DEADLINE_KEYS``, …
     """
     for _ in range(N_SCALARS):
         s.scalars.append(0)
     s.scalars[N_IDLE] = n_workers
-    s.scalars[PREEMPTIVE] = preemptive
     s.scalars[PROPAGATE] = propagate
-    s.scalars[DISPATCH_OVERHEAD] = dispatch_overhead
-    s.scalars[SWITCH_OVERHEAD] = switch_overhead
-    s.scalars[POLLING] = polling
     s.scalars[URGENCY] = urgency
     s.scalars[JUDGE_FROM], s.scalars[JUDGE_UNTIL] = -NEVER, NEVER
     s.scalars[FORGET_AT] = NEVER
@@ -216,15 +206,13 @@ def fill_state(
         s.holder.append(0)
         s.measured_at.append(-1)
         s.expected.append(HERE)
+        s.process.append(1)
     for i in range(len(t.reach_start)):
         s.reach_by.append(t.reach_start[i])
-    for _ in range(2):
-        add_process(s)
-    for _ in range(len(t.leg_topic)):
+    add_process(s, 0)
+    add_process(s, n_workers)
+    for _ in range(t.n_queues):
         add_queue(s)
-    if polling != 0:
-        for _ in range(t.n_entities):
-            s.first_order.append(NEVER)
     for _ in range(t.n_groups):
         add_group(s)
     for _ in range(n_workers):
@@ -285,17 +273,9 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_follows.append(0)
 
 
-def divide(s: State, workers: list[int]) -> None:
-    """Give each process its number of workers and an interpreter (rule 12)."""
-    for process in range(len(workers)):
-        for _ in range(workers[process]):
-            s.pool.append(process + 1)
-        if process > 0:
-            add_process(s)
-
-
-def add_process(s: State) -> None:
-    """Add the columns of a process."""
+def add_process(s: State, n_workers: int) -> None:
+    """Add a process with an interpreter of its own."""
+    s.n_workers.append(n_workers)
     s.overtaking.append(1)
     s.demoted_below.append(0)
     s.overloaded.append(0)

@@ -36,7 +36,7 @@ topic is one that the vertex may publish.  ``gates``, from ``first_gate`` of a s
 executions, as offsets in the region of a job, that such edges on its paths start; the sink is due
 when all of them are known to start.
 
-``driven``: DRIVEN for a sync with ``driven_by`` (rule 16), AFTER_DRIVEN for all vertices after
+``driven``: DRIVEN for a sync with ``driven_by`` (rule 14), AFTER_DRIVEN for all vertices after
 one, their sum for both.
 
 ``judged``: 0 for a sink without a deadline (``deadline: none``).  It is ordered as if it had one
@@ -48,8 +48,8 @@ starves.
 For policies that order callbacks, not jobs:
 
 * ``entity``: index of the callback in the wait set of an executor of ROS 2: timers, then
-subscriptions, services and clients, each in the order of the declaration.  A sync has consecutive
-indices for its topics.  Vertices of one callback are one entity.
+subscriptions, services and clients, each in the order of the declaration.  Vertices of one
+callback are one entity.
 * ``chain_rank``: fixed priority by chains, as in PiCAS; smaller is more urgent.  A chain is a path
 from the source to a sink.  Chains rank by the sink's relative deadline, then by the period and
 order of their DAGs; a callback has the rank of its most urgent chain (so all paths of a DAG with
@@ -82,7 +82,7 @@ UNJUDGED_NS = 1_000_000_000
 
 CONTINUE, DEMOTE = range(2)
 KEEP_ALL, KEEP_TIMELY, KEEP_NEWEST = range(3)
-"""Which waiting executions remain when the next one is ready (rule 13)."""
+"""Which waiting executions remain when the next one is ready (rule 11)."""
 DRIVEN, AFTER_DRIVEN = 1, 2
 """Bits of ``Tables.driven``."""
 IMPORTANCE = {'low': 0, 'normal': 1, 'high': 2}
@@ -137,7 +137,6 @@ class Tables(NamedTuple):
     region_offset: list[int]
     n_legs: list[int]
     first_leg: list[int]
-    leg_topic: list[int]
     n_predecessors: list[int]
     first_successor: list[int]
     successors: list[int]
@@ -149,6 +148,7 @@ class Tables(NamedTuple):
     process: list[int]
     n_groups: int
     n_entities: int
+    n_queues: int
 
     @staticmethod
     def build(
@@ -192,11 +192,11 @@ class _Columns:
         self._on_late = on_late
         self._groups: dict[tuple[str, str], int] = {}
         self._entities: dict[str, int] = {}
-        self._n_entities = 0
+        self._n_queues = 0
         # the callback of each vertex, and its most urgent chain
         self._chains: list[tuple[str, tuple[int, ...]]] = []
         names = [n for n in Tables._fields if n not in (
-            'n_dags', 'n_vertices', 'n_groups', 'n_entities')]
+            'n_dags', 'n_vertices', 'n_groups', 'n_entities', 'n_queues')]
         self.lists: dict[str, list[int]] = {name: [] for name in names}
         self.lists['first_sink'].append(0)
         self.lists['first_successor'].append(0)
@@ -206,8 +206,7 @@ class _Columns:
     def enter(self, callbacks: Sequence[Callback]) -> None:
         """Assign each declared callback its index in the wait set."""
         for callback in sorted(callbacks, key=lambda each: _WAIT_SET[each.kind]):
-            self._entities[callback.key] = self._n_entities
-            self._n_entities += max(1, len(callback.topics)) if self._legs else 1
+            self._entities[callback.key] = len(self._entities)
 
     def add_dag(self, dag: Dag) -> None:
         lists = self.lists
@@ -224,10 +223,9 @@ class _Columns:
                 dag.vertices, rad_offsets(dag), path_lengths(dag, [1] * len(dag.vertices)))]
         region = 0
         for vertex, sinks in zip(dag.vertices, reached):
-            countdown, topics = len(vertex.predecessors), [0]
+            countdown, n_legs = len(vertex.predecessors), 1
             if self._legs and countdown > 0:
-                topics = [topic for topic, _ in legs_of(vertex, dag.vertices)]
-                countdown = len(topics)
+                countdown = n_legs = len(legs_of(vertex, dag.vertices))
             lists['dag_of'].append(dag.index)
             lists['index_in_dag'].append(vertex.index)
             lists['rad_offset'].append(min(deadline for _, deadline, _ in sinks))
@@ -248,9 +246,8 @@ class _Columns:
             lists['judged'].append(int(vertex.deadline_ns is not None))
             lists['entity'].append(self._entities[vertex.callback.key])
             lists['region_offset'].append(region)
-            lists['n_legs'].append(len(topics))
-            lists['first_leg'].append(len(lists['leg_topic']))
-            lists['leg_topic'].extend(topics)
+            lists['n_legs'].append(n_legs)
+            lists['first_leg'].append(self._n_queues)
             lists['n_predecessors'].append(countdown)
             lists['successors'].extend(first + s for s in reversed(vertex.successors))
             starts_sometimes = {after for after, _ in maybe[vertex.index]}
@@ -258,7 +255,8 @@ class _Columns:
                 int(after in starts_sometimes) for after in reversed(vertex.successors))
             lists['first_successor'].append(len(lists['successors']))
             lists['group'].append(self._group(vertex.callback.node, vertex.callback.group))
-            region += len(topics)
+            region += n_legs
+            self._n_queues += n_legs
         self._add_gates(dag, first, maybe)
         lists['driven'].extend([0] * len(dag.vertices))
         for index in topological_order(dag):
@@ -310,8 +308,8 @@ class _Columns:
             'keep': KEEP_ALL, 'mean_time': 0, 'height': 0,
             'importance': IMPORTANT, 'tolerated': 0, 'tolerated_of': 0,
             'sink_deadline': -1, 'judged': 0,
-            'entity': self._n_entities, 'region_offset': 0,
-            'n_legs': 1, 'first_leg': len(lists['leg_topic']), 'leg_topic': 0,
+            'entity': len(self._entities), 'region_offset': 0,
+            'n_legs': 1, 'first_leg': self._n_queues,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
             'driven': 0, 'first_gate': len(lists['gates']), 'group': -1, 'process': 1,
             'period': default_deadline, 'dag_deadline': default_deadline, 'on_late': self._on_late,
@@ -324,7 +322,7 @@ class _Columns:
         lists['chain_rank'] = self._ranks()
         return Tables(
             n_dags=n_dags, n_vertices=n_vertices, n_groups=len(self._groups),
-            n_entities=self._n_entities, **lists)
+            n_entities=len(self._entities), n_queues=self._n_queues + 1, **lists)
 
     def _ranks(self) -> list[int]:
         """Return the rank of each vertex's callback, by its most urgent vertex."""

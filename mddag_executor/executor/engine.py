@@ -335,7 +335,7 @@ class Engine:
     def allow_bypass(self) -> None:
         """Let undeclared executions bypass the core, if the policy runs them as they come."""
         policy, undeclared = self.scheduler.policy, self.tables.n_vertices
-        self._may_bypass = not policy.polling and policy.key(
+        self._may_bypass = policy.key(
             self.tables, undeclared, 0, 1, 0) < policy.key(self.tables, undeclared, 0, 0, 1)
 
     def _is_core_empty(self) -> bool:
@@ -516,9 +516,9 @@ class Engine:
         step, state, holders = self._step, self._state, self._holders
         step.overtaken = None
         step.deadline = self.deadlines.next
-        if self._lane or state.ready or state.held_back or state.unpolled:
+        if self._lane or state.ready or state.held_back:
             work = step.work = self._dispatch(worker, now)
-            waits = bool(self._lane or state.ready or state.held_back or state.unpolled)
+            waits = bool(self._lane or state.ready or state.held_back)
         else:
             work = step.work = None
             waits = False
@@ -583,7 +583,7 @@ class Engine:
                 self._core()
         if work is None:
             state = self._state
-            if not (state.ready or state.held_back or state.unpolled):
+            if not (state.ready or state.held_back):
                 return None
             if state.worker_x[worker] >= 0:
                 if not state.scalars[N_IDLE]:

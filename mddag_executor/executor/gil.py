@@ -6,7 +6,7 @@ Whether a callback holds the GIL: declared, or measured at each execution.
 Theory of operation
 -------------------
 Python's global interpreter lock (GIL) lets one thread compute at a time.  The core therefore
-starts a callback that holds the GIL only if no callback as urgent holds it (rule 11 of
+starts a callback that holds the GIL only if no callback as urgent holds it (rule 10 of
 ``core.rules``).
 
 1.  *Measured.*  Of each execution, three times are measured: its duration (wall), the CPU time of

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from mddag_executor.core import Tables
 from mddag_executor.core.queues import (
     first_of,
+    first_waiting,
     has_place,
     overtaking_pays,
     overtaking_pays_from,
@@ -66,14 +67,15 @@ class Interpreter:
         """Return whether the first waiting execution may overtake the latest holder."""
         work = self.holders[-1]
         return overtaking_pays(
-            self._tables, self._state, 1, now - self._held_from(work),
-            work.entity.habit.mean_ns, self.pauses)
+            self._tables, self._state, first_waiting(self._state),
+            now - self._held_from(work), work.entity.habit.mean_ns, self.pauses)
 
     def overtaking_at(self) -> int:
         """Return when the first waiting execution may overtake the latest holder."""
         work = self.holders[-1]
         return self._held_from(work) + overtaking_pays_from(
-            self._tables, self._state, 1, work.entity.habit.mean_ns, self.pauses)
+            self._tables, self._state, first_waiting(self._state), work.entity.habit.mean_ns,
+            self.pauses)
 
     def usual_end(self, work: Work) -> int:
         """Return until when a running execution computes if it takes twice as long as usual."""
@@ -90,7 +92,7 @@ class Interpreter:
             return False
         ready, held_back = state.ready, state.held_back
         is_held = bool(self.holders)
-        if state.unpolled or len(ready) > MOST or held_back and not is_held:
+        if len(ready) > MOST or held_back and not is_held:
             return True
         x_holds, x_group, owners = state.x_holds, state.x_group, state.group_owner
         has_outer = bool(state.outer_limit)
@@ -112,4 +114,4 @@ class Interpreter:
 
 def has_waiting(state: State) -> bool:
     """Return whether any execution waits in the core, except for its callback group."""
-    return bool(state.ready or state.held_back or state.unpolled)
+    return bool(state.ready or state.held_back)

@@ -14,7 +14,7 @@ For such DAGs only:
 
 1.  A vertex is *here* when an entity of this executor is bound to its callback now.  A job has in
     this process the vertices that are here when it is released here; its other sinks are judged
-    elsewhere (rule 10 of ``core.rules``).
+    elsewhere (rule 9 of ``core.rules``).
 2.  A message whose publication is known here belongs to that publication's job.
 3.  Any other message on a topic *enters* when exactly one vertex that is not here publishes the
     topic to it (or several do to one sync, which waits for as many messages), and its header has a

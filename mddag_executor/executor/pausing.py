@@ -5,7 +5,7 @@ Callbacks that compute in Python pause for more urgent ones.
 
 Theory of operation
 -------------------
-A callback that is overtaken (rule 11 of ``core.rules``) would share the GIL with the more urgent
+A callback that is overtaken (rule 10 of ``core.rules``) would share the GIL with the more urgent
 one: each time that one gives it away, for example in numpy, the overtaken one keeps it for a
 switch interval.  Instead it pauses at the next line or jump of its own code: ``sys.monitoring``
 (Python 3.12) calls a function there, which waits for a lock.  With an older Python, and if other

@@ -24,7 +24,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 from mddag_executor import defaults
-from mddag_executor.core import policy as find_policy
 from mddag_executor.core import Tables
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.laboratory.draws import (
@@ -36,6 +35,7 @@ from mddag_executor.laboratory.draws import (
     Times,
     utilisations,
 )
+from mddag_executor.simulate.policies import preempts
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import periodic_load
 from msg_graph import TaskSet
@@ -70,7 +70,7 @@ class Experiment:
 
     def settings(self, policy: str) -> Settings:
         """Return how to simulate a run under a policy."""
-        preemptive = find_policy(policy).mode(self.preemptive)
+        preemptive = preempts(policy, self.preemptive)
         return Settings(
             policy=policy, workers=self.workers, duration_ns=self.duration_ns,
             preemptive=preemptive, judge=self.judge, stop_at_first_miss=True,

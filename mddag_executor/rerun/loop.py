@@ -126,7 +126,7 @@ class Loop:
         self.warnings: list[str] = []
         self._state = engine.scheduler.state
         self._machine = empty(Machine)
-        fill_machine(engine.tables, self._state, self._machine, cpus or NEVER, int(python))
+        fill_machine(self._state, self._machine, cpus or NEVER, int(python))
         settle(self._state, self._machine, start)
         # by worker: what runs on it, and when that ends if nothing changes
         self._running: list[Execution | None] = [None] * engine.n_workers
@@ -217,7 +217,7 @@ class Loop:
 
     def _share(self) -> None:
         """Decide which executions go on, and when they end."""
-        share(self.engine.tables, self._state, self._machine, self.now, self._finish_at)
+        share(self._state, self._machine, self.now, self._finish_at)
         for worker, execution in enumerate(self._running):
             if execution is None:  # it waits
                 self._finish_at[worker] = NEVER
@@ -275,8 +275,7 @@ class Loop:
             work.entity.habit.took(takes, takes)
         if execution.worker >= 0 and self.now == execution.start:  # it has not waited
             state, x = self._state, work.x
-            state.x_left[x] += takes - state.x_cost[x]  # else the core cannot say how far it is
-            state.x_cost[x] = takes
+            state.x_cost[x] = state.x_left[x] = takes
             begins(state, self._machine, x, takes, work.cpu_ns)
             self._running[work.worker] = execution
             return

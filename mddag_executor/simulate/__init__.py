@@ -4,6 +4,7 @@
 
 from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, START
 from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.policies import ALL_POLICIES, policy
 from mddag_executor.simulate.run import JUDGES, simulate, SimulatedRun
 from mddag_executor.simulate.schedule import schedule, Scheduled, Settings
 from mddag_executor.simulate.workload import (
@@ -15,7 +16,7 @@ from mddag_executor.simulate.workload import (
 )
 
 __all__ = [
-    'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'START', 'Scheduled', 'Settings',
-    'SimulatedRun', 'draw_execution_times', 'periodic_load',
+    'ALL_POLICIES', 'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'START', 'Scheduled',
+    'Settings', 'SimulatedRun', 'draw_execution_times', 'periodic_load', 'policy',
     'read_execution_times', 'scale_execution_times', 'schedule', 'simulate', 'utilisation',
 ]

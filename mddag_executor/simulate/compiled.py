@@ -36,15 +36,16 @@ from typing import Any
 
 from mddag_executor import progress
 from mddag_executor.core import jobs, overload, policies, queues, rules, state, tables
-from mddag_executor.core.policies import POLICIES
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
 from mddag_executor.errors import UsageError
-from mddag_executor.simulate import deliveries, engine, load, machine
+from mddag_executor.simulate import deliveries, dispatch, engine, load, machine, polling, pool
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import LogEntry, Orders
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.policies import ALL_POLICIES
+from mddag_executor.simulate.pool import Pool
 import numpy as np
 import numpy.typing as npt
 
@@ -52,11 +53,12 @@ _COMPILE_S = 35.0   # approximate compile time
 _REPEATS = 4        # assumed repetitions of such work, as with other settings
 
 _MODULES = (
-    tables, state, queues, jobs, overload, policies, rules, load, machine, deliveries, engine)
+    tables, state, queues, jobs, overload, policies, rules, load, pool, polling, dispatch, machine,
+    deliveries, engine)
 _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'add_heap', 'rad_offsets', 'reached_sinks', 'mean_time',
-    'policy', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
+    'policy', 'find', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
 ENTRY_POINTS = ('free_run', 'run_each')
 _REPLACED = ('add_heap', 'heapify', 'heappop', 'heappush')
 
@@ -194,11 +196,11 @@ def run_each(
         the last run; and by run 1 if a deadline was missed, otherwise 0.
     """
     load = load._replace(cost_base=[*load.cost_base])   # is changed
-    lent = [Memory(*tables, list(POLICIES).index(policy)), Memory(*load), Memory(*orders)]
+    lent = [Memory(*tables, list(ALL_POLICIES).index(policy)), Memory(*load), Memory(*orders)]
     missed = Memory(np.zeros(runs))
-    core, _, _, busy, log = working = [
+    core, _, _, _, busy, log = working = [
         Memory(*[0] * len(fields)) for fields in (
-            State._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
+            State._fields, Pool._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
     addresses = [each.address for each in working]
     ended = entry_points()['run_each'](
         *(each.address for each in lent), *addresses, missed.address)

@@ -9,7 +9,7 @@ If transport takes time, an edge to a successor is satisfied ``delay`` after its
 the core gets each edge by ``rules.edge``.  With a negative delay the callback published before its
 end: the edge is satisfied that long before the end, but not before the start.  With preemption,
 edges are satisfied at the end.  A delay of NEVER means that nothing is published; over an edge
-that its publisher takes only sometimes, the vertex is then not due (rule 15).  If executions
+that its publisher takes only sometimes, the vertex is then not due (rule 13).  If executions
 may be stopped (see ``machine``), the end is not known in advance, but the *place* is: the progress
 of the execution when it publishes.
 
@@ -23,10 +23,13 @@ from typing import NamedTuple
 
 from mddag_executor.core import jobs, rules
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.state import OPEN, PREEMPTIVE, QueueEntry, State
+from mddag_executor.core.state import OPEN, QueueEntry, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.load import FAILS, Load, place_of
-from mddag_executor.simulate.machine import is_used, Machine
+from mddag_executor.simulate.machine import is_used, Machine, progress
+
+# Columns of ``Deliveries.scalars``.
+SENT, MAY_PREEMPT = range(2)
 
 DELAY_NS = 1_000_000
 """Time of a message to another process of this machine whose interpreter is busy."""
@@ -37,13 +40,14 @@ class Deliveries(NamedTuple):
     The messages of one run of a state made with ``propagate=2``; initially empty.
 
     ``messages`` is a heap of messages in transport: (time, order, slot, job, vertex that it
-    starts); ``sent`` has one element, their total number.  ``next_vertex`` has, by running
+    starts); ``scalars`` has their total number, and whether executions may be preempted.
+    ``next_vertex`` has, by running
     execution that may be stopped, the vertex that it starts next before its end, at
     ``Machine.publishes_at``.
     """
 
     messages: list[QueueEntry]
-    sent: list[int]
+    scalars: list[int]
     next_vertex: list[int]
 
 
@@ -66,7 +70,7 @@ def sends_at_start(
     """Send the messages of a started execution, as far as their times are known."""
     vertex = s.x_vertex[x]
     first, end = t.first_successor[vertex], t.first_successor[vertex + 1]
-    if s.scalars[PREEMPTIVE] != 0 or first == end:
+    if d.scalars[MAY_PREEMPT] != 0 or first == end:
         return
     if is_used(m):
         while len(d.next_vertex) <= x:
@@ -115,7 +119,7 @@ def ends_sending(
         if s.job_state[slot] == OPEN:
             _withhold_unsent(t, s, load, x, now)
         rules.complete(t, s, key, x, now)
-    preemptive = s.scalars[PREEMPTIVE] != 0
+    preemptive = d.scalars[MAY_PREEMPT] != 0
     for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
         delay = delay_of(t, s, load, x, edge)
         if delay == 0 or (delay < 0 and preemptive):
@@ -143,7 +147,7 @@ def arrive_due(
         for worker in range(len(s.worker_x)):
             x = s.worker_x[worker]
             if x >= 0 and m.publishes_at[x] < NEVER:
-                at = rules.progress(s, x, now)
+                at = progress(s, x, now)
                 while m.publishes_at[x] <= at:
                     _publish_next(t, s, key, load, d, m, x, now)
 
@@ -159,8 +163,8 @@ def _publish_next(
 def _post(s: State, d: Deliveries, time: int, x: int, vertex: int) -> None:
     slot = s.x_slot[x]
     if time < NEVER:
-        d.sent[0] += 1
-        heappush(d.messages, (time, d.sent[0], slot, s.job_index[slot], vertex))
+        d.scalars[SENT] += 1
+        heappush(d.messages, (time, d.scalars[SENT], slot, s.job_index[slot], vertex))
 
 
 def _arrive(

@@ -29,7 +29,6 @@ from mddag_executor.core import jobs, overload, rules
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.state import (
     add_slot,
-    divide,
     EXPIRED,
     fill_state,
     JUDGE_FROM,
@@ -44,6 +43,7 @@ from mddag_executor.simulate.deliveries import (
     next_arrival,
     sends_at_start,
 )
+from mddag_executor.simulate.dispatch import dispatch
 from mddag_executor.simulate.load import Load, needs_python, SKIPPED
 from mddag_executor.simulate.machine import (
     decide,
@@ -55,6 +55,7 @@ from mddag_executor.simulate.machine import (
     share,
     starts,
 )
+from mddag_executor.simulate.pool import divide, fill_pool, Pool
 
 # Kinds of log entries.
 START, END, PREEMPT = range(3)
@@ -83,11 +84,11 @@ class Orders(NamedTuple):
 
 
 def run(
-    t: Tables, s: State, d: Deliveries, m: Machine, key: KeyFunction, load: Load, o: Orders,
-    busy: list[int], log: list[LogEntry], progress: Callable[[int], None] | None,
+    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Load,
+    o: Orders, busy: list[int], log: list[LogEntry], progress: Callable[[int], None] | None,
 ) -> int:
     """
-    Run the core over a load, with an empty state, deliveries and machine; return the end, ns.
+    Run the core over a load, with an empty state, pool, …; return the end, ns.
 
     Decisions are in ``s.decisions``.  With ``Orders.stop_at_first_miss`` the run ends with the
     instant at which the first miss is known: a late completion, or an early end of a job.
@@ -95,7 +96,7 @@ def run(
     :param busy: receives by worker its busy time, ns; ``log``: the log of the workers, if wanted.
     :param progress: receives the virtual time at each event.
     """
-    _fill(t, s, d, m, load, o)
+    _fill(t, s, p, d, m, load, o)
     sends, stops = len(load.delay_base) > 0, is_used(m)
     n_workers, n_releases = len(s.worker_x), len(load.times)
     finish_at, running, since = [NEVER] * n_workers, [-1] * n_workers, [-1] * n_workers
@@ -140,9 +141,9 @@ def run(
         while next_release < n_releases and load.times[next_release] == now:
             release_load(t, s, key, load, next_release, now)
             next_release += 1
-        _dispatch(t, s, d, m, key, load, o, now, finish_at, running, since, busy, log)
+        _dispatch(t, s, p, d, m, key, load, o, now, finish_at, running, since, busy, log)
         if stops:
-            share(t, s, m, now, finish_at)
+            share(s, m, now, finish_at)
         if o.stop_at_first_miss != 0 and any_missed(s, seen):
             break
     for w in range(n_workers):
@@ -153,19 +154,21 @@ def run(
     return now
 
 
-def _fill(t: Tables, s: State, d: Deliveries, m: Machine, load: Load, o: Orders) -> None:
+def _fill(
+    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, load: Load, o: Orders
+) -> None:
     """Fill the columns of an empty state, and of deliveries and machine if the load needs them."""
     sends = len(load.delay_base) > 0
-    fill_state(
-        t, s, o.workers * o.processes, o.preemptive, 2 if sends else 1, o.dispatch_overhead,
-        o.switch_overhead, o.polling, o.urgency)
+    fill_state(t, s, o.workers * o.processes, 2 if sends else 1, o.urgency)
+    fill_pool(t, s, p, o.preemptive, o.polling, o.dispatch_overhead, o.switch_overhead)
     if o.processes > 1:
-        divide(s, [o.workers] * o.processes)
+        divide(t, s, p, o.processes, o.workers)
     s.scalars[JUDGE_FROM], s.scalars[JUDGE_UNTIL] = o.judge_from, o.judge_until
     if sends:
-        d.sent.append(0)
+        d.scalars.append(0)
+        d.scalars.append(o.preemptive)
     if len(load.holds) > 0 or o.cpus < NEVER:
-        fill_machine(t, s, m, o.cpus, int(needs_python(load)))
+        fill_machine(s, m, o.cpus, int(needs_python(load)))
     if len(load.holds) > 0:
         for v in range(t.n_vertices):
             place = load.cost_base[t.dag_of[v]] + t.region_offset[v]  # of its first job, if any
@@ -199,7 +202,7 @@ def release_load(
             jobs.give_up(t, s, slot, EXPIRED, now)
             return
     for place in range(t.n_region[dag]):
-        s.x_cost[base + place] = load.costs[cost + place]
+        s.x_cost[base + place] = s.x_left[base + place] = load.costs[cost + place]
     if len(load.holds) > 0:
         for place in range(t.n_region[dag]):
             s.x_holds[base + place] = load.holds[cost + place]
@@ -207,15 +210,15 @@ def release_load(
 
 
 def _dispatch(
-    t: Tables, s: State, d: Deliveries, m: Machine, key: KeyFunction, load: Load, o: Orders,
-    now: int, finish_at: list[int], running: list[int], since: list[int], busy: list[int],
-    log: list[LogEntry],
+    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Load,
+    o: Orders, now: int, finish_at: list[int], running: list[int], since: list[int],
+    busy: list[int], log: list[LogEntry],
 ) -> None:
     """Dispatch executions; ``running`` has the preempted executions for the log."""
     sends, stops = len(load.delay_base) > 0, is_used(m)
     if stops:
-        decide(t, s, m, now)
-    x = rules.schedule(t, s, key, now)
+        decide(t, s, p, m, now)
+    x = dispatch(t, s, p, key, now)
     while x >= 0:
         worker = s.x_worker[x]
         finish_at[worker] = now + s.x_left[x]
@@ -232,8 +235,8 @@ def _dispatch(
         if sends:
             sends_at_start(t, s, load, d, m, x, now)
         if stops:
-            decide(t, s, m, now)
-        x = rules.schedule(t, s, key, now)
+            decide(t, s, p, m, now)
+        x = dispatch(t, s, p, key, now)
 
 
 def _note(

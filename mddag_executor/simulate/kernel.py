@@ -14,13 +14,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from mddag_executor.core.policies import Key, POLICIES
+from mddag_executor.core.policies import Key
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import any_missed, Orders, run
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.policies import ALL_POLICIES
+from mddag_executor.simulate.pool import Pool
 from mddag_executor.simulate.vectors import at, free, StructureType, VectorType
 from numba import extending, types
 
@@ -45,6 +47,7 @@ def _structure(row: Any, **more: Any) -> Any:
 # Functions for compiled code that turn an address into a structure or vector.
 as_tables = at(_structure(Tables, policy=types.int64))
 as_state = at(_structure(State))
+as_pool = at(_structure(Pool))
 as_load = at(_structure(Load))
 as_deliveries = at(_structure(Deliveries))
 as_machine = at(_structure(Machine))
@@ -52,6 +55,7 @@ as_orders = at(_structure(Orders))
 as_log = at(VectorType(6))
 as_vector = at(VectorType())
 STATE_FIELDS = len(State._fields)
+POOL_FIELDS = len(Pool._fields)
 DELIVERIES_FIELDS = len(Deliveries._fields)
 MACHINE_FIELDS = len(Machine._fields)
 
@@ -63,14 +67,14 @@ def key_of_policy(t: Any, v: int, release: int, job: int, order: int) -> Key:
     It is an overloaded function, because only these can be passed between functions in stored
     code.
     """
-    key: Key = list(POLICIES.values())[t.policy].key(t, v, release, job, order)
+    key: Key = list(ALL_POLICIES.values())[t.policy].key(t, v, release, job, order)
     return key
 
 
 def bind_policies(space: dict[str, Any]) -> None:
     """Register ``key_of_policy`` with numba, with the key functions of a namespace."""
     arguments = 't, v, release, job, order'
-    *others, last = (row.key.__name__ for row in POLICIES.values())
+    *others, last = (row.key.__name__ for row in ALL_POLICIES.values())
     lines = [f'def choose({arguments}):']
     for number, key in enumerate(others):
         lines += [f'    if t.policy == {number}:', f'        return {key}({arguments})']
@@ -81,8 +85,8 @@ def bind_policies(space: dict[str, Any]) -> None:
 
 
 def run_each(
-    tables: int, load: int, orders: int, state: int, deliveries: int, machine: int, busy: int,
-    log: int, missed: int,
+    tables: int, load: int, orders: int, state: int, pool: int, deliveries: int, machine: int,
+    busy: int, log: int, missed: int,
 ) -> int:
     """
     Run a load with one row of execution times after another; return when the last run ended.
@@ -95,24 +99,25 @@ def run_each(
     ended = 0
     for number in range(len(misses)):
         if number > 0:
-            free_run(state, deliveries, machine, busy, log)
+            free_run(state, pool, deliveries, machine, busy, log)
             for dag in range(len(rows.cost_base)):
                 rows.cost_base[dag] += t.n_vertices
         ended = run(
-            t, s, as_deliveries(deliveries), as_machine(machine), key_of_policy, rows,
-            as_orders(orders), as_vector(busy), as_log(log), None)
+            t, s, as_pool(pool), as_deliveries(deliveries), as_machine(machine), key_of_policy,
+            rows, as_orders(orders), as_vector(busy), as_log(log), None)
         misses[number] = int(any_missed(s, 0))
     return ended
 
 
-def free_run(state: int, deliveries: int, machine: int, busy: int, log: int) -> None:
+def free_run(state: int, pool: int, deliveries: int, machine: int, busy: int, log: int) -> None:
     """Free the results of a run."""
     s, m = as_state(state), as_machine(machine)
     for group in range(len(s.group_heap)):
         free(s.group_heap[group])
     for process in range(len(m.lock_queue)):
         free(m.lock_queue[process])
-    for structure, fields in ((state, STATE_FIELDS), (deliveries, DELIVERIES_FIELDS),
-                              (machine, MACHINE_FIELDS), (busy, 1), (log, 1)):
+    for structure, fields in ((state, STATE_FIELDS), (pool, POOL_FIELDS),
+                              (deliveries, DELIVERIES_FIELDS), (machine, MACHINE_FIELDS),
+                              (busy, 1), (log, 1)):
         for field in range(fields):
             free(as_vector(structure + 24 * field))

@@ -14,7 +14,7 @@ In isolation, an execution takes its cost.  It passes through these parts, in th
 4. it computes with the GIL again: the rest of its CPU time, in which it publishes.
 
 An execution that does not get the GIL or CPU that it needs is stopped.  The rules of the core
-(rule 11) decide which executions that hold the interpreter are started.  This module decides how
+(rule 10) decide which executions that hold the interpreter are started.  This module decides how
 running executions share it:
 
 * **The GIL.**  An execution keeps it until it no longer needs it, or until another one has waited
@@ -32,17 +32,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mddag_executor.core.queues import first_waiting, overtaking_pays, overtaking_pays_from
-from mddag_executor.core.rules import progress
-from mddag_executor.core.state import (
-    add_heap,
-    add_process,
-    N_HOLDING,
-    PREEMPTIVE,
-    State,
-)
+from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from
+from mddag_executor.core.state import add_heap, N_HOLDING, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.load import Load, place_of
+from mddag_executor.simulate.pool import first_to_run, Pool, PREEMPTIVE
 
 SWITCH_NS = 1_000_000
 """Python's switch interval while an executor spins."""
@@ -89,7 +83,7 @@ class Machine(NamedTuple):
     switch_at: list[int]
 
 
-def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> None:
+def fill_machine(s: State, m: Machine, cpus: int, python: int) -> None:
     """
     Fill the columns of an empty machine, on which nothing runs yet.
 
@@ -98,9 +92,6 @@ def fill_machine(t: Tables, s: State, m: Machine, cpus: int, python: int) -> Non
     """
     for value in (cpus, python, 0, NEVER, NEVER, 1, NEVER):
         m.scalars.append(value)
-    for vertex in range(len(t.process)):
-        while len(s.overtaking) <= t.process[vertex]:
-            add_process(s)
     for _ in range(len(s.overtaking)):
         add_heap(m.lock_queue)
         m.lock_had.append(-1)
@@ -112,6 +103,11 @@ def is_used(m: Machine) -> bool:
     return len(m.scalars) > 0
 
 
+def progress(s: State, x: int, now: int) -> int:
+    """Return the execution time of a running execution so far, ns."""
+    return s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
+
+
 def settle(s: State, m: Machine, now: int) -> None:
     """Advance the machine to the present time."""
     passed = now - m.scalars[COUNTED_UNTIL]
@@ -120,10 +116,10 @@ def settle(s: State, m: Machine, now: int) -> None:
     m.scalars[COUNTED_UNTIL] = now
 
 
-def decide(t: Tables, s: State, m: Machine, now: int) -> None:
+def decide(t: Tables, s: State, p: Pool, m: Machine, now: int) -> None:
     """Decide by process whether the first waiting execution may overtake the last holder."""
     m.scalars[OVERTAKE_AT] = NEVER
-    if s.scalars[N_HOLDING] == 0 or (len(s.ready) == 0 and len(s.held_back) == 0):
+    if s.scalars[N_HOLDING] == 0 or first_to_run(s, p, 0) < 0:
         return
     for process in range(1, len(s.overtaking)):
         s.overtaking[process] = 1
@@ -133,14 +129,14 @@ def decide(t: Tables, s: State, m: Machine, now: int) -> None:
             if (x >= 0 and s.x_holds[x] == process
                     and (last < 0 or s.x_started[x] >= s.x_started[last])):
                 last = x
-        first = first_waiting(t, s, process) if last >= 0 else -1
+        first = first_to_run(s, p, process) if last >= 0 else -1
         if first >= 0 and s.x_holds[first] == process:
-            preempts = s.scalars[PREEMPTIVE] != 0
+            preempts = p.scalars[PREEMPTIVE] != 0
             s.overtaking[process] = int(overtaking_pays(
-                t, s, process, now - s.x_started[last], s.x_cost[last], preempts))
+                t, s, first, now - s.x_started[last], s.x_cost[last], preempts))
             if s.overtaking[process] == 0:
                 pays_at = s.x_started[last] + overtaking_pays_from(
-                    t, s, process, s.x_cost[last], preempts)
+                    t, s, first, s.x_cost[last], preempts)
                 if now < pays_at < m.scalars[OVERTAKE_AT]:
                     m.scalars[OVERTAKE_AT] = pays_at
 
@@ -181,7 +177,7 @@ def _set_parts(m: Machine, x: int, first: int, second: int, third: int) -> None:
     m.waits_until[x] = third
 
 
-def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> None:
+def share(s: State, m: Machine, now: int, finish_at: list[int]) -> None:
     """Assign the GIL and CPUs, and compute when executions finish."""
     number = m.scalars[SHARES] = m.scalars[SHARES] + 1
     m.joining.clear()
@@ -189,7 +185,7 @@ def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> No
     for worker in range(len(on)):
         x = on[worker]
         if x >= 0:
-            _find_need(t, s, m, x, progress(s, x, now))
+            _find_need(s, m, x, progress(s, x, now))
     for process in range(1, len(m.lock_queue)):
         if len(m.lock_queue[process]) > 0:
             _pass_lock(s, m, process, now)
@@ -215,7 +211,7 @@ def share(t: Tables, s: State, m: Machine, now: int, finish_at: list[int]) -> No
     m.scalars[NEXT_TIME] = next_time
 
 
-def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
+def _find_need(s: State, m: Machine, x: int, at: int) -> None:
     """Find what an execution needs at its progress; queue it for a new need."""
     need, until = _NOTHING, s.x_cost[x]
     if at < m.locked_until[x]:
@@ -230,20 +226,20 @@ def _find_need(t: Tables, s: State, m: Machine, x: int, at: int) -> None:
     if need == _LOCK:
         interpreter = s.x_holds[x]
         if interpreter == 0:
-            interpreter = t.process[s.x_vertex[x]]
+            interpreter = s.process[s.x_vertex[x]]
         if x not in m.lock_queue[interpreter]:
-            _ask(t, s, m, x, interpreter)
+            _ask(s, m, x, interpreter)
     elif need == _CPU and x not in m.computing:
         m.joining.append(x)
 
 
-def _ask(t: Tables, s: State, m: Machine, x: int, interpreter: int) -> None:
+def _ask(s: State, m: Machine, x: int, interpreter: int) -> None:
     """Queue for the GIL; an execution that follows an ended holder gets its place."""
     queue = m.lock_queue[interpreter]
     if len(queue) > 0 and m.at[x] == 0:
         first = queue[0]
         if (s.x_worker[first] < 0 and m.need[first] == _CPU
-                and t.process[s.x_vertex[first]] == t.process[s.x_vertex[x]]):
+                and s.process[s.x_vertex[first]] == s.process[s.x_vertex[x]]):
             queue[0] = x
             if m.lock_had[interpreter] == first:
                 m.lock_had[interpreter] = x

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 from mddag_executor import defaults
 from mddag_executor.core import NEVER, Tables, Tally
-from mddag_executor.core import policy as find_policy
 from mddag_executor.core.state import (
     as_object,
     Decision,
@@ -24,6 +23,9 @@ from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import LogEntry, Orders, run
 from mddag_executor.simulate.load import as_list, as_lists, Load
 from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.policies import policy as find_policy
+from mddag_executor.simulate.policies import preempts, ROS2
+from mddag_executor.simulate.pool import Pool
 
 # Approximate time of plain Python per execution, without and with a machine, to choose the faster.
 PLAIN_S, _STOPS_S = 10e-6, 50e-6
@@ -67,14 +69,14 @@ class Settings:
     @property
     def preempts(self) -> bool:
         """Return whether a more urgent execution preempts a running one."""
-        return find_policy(self.policy).mode(self.preemptive, self.processes)
+        return preempts(self.policy, self.preemptive, self.processes)
 
     @property
     def orders(self) -> Orders:
         """Return the settings as integers for the engine; raise like ``preempts``."""
         return Orders(
             self.workers, self.processes, int(self.preempts),
-            int(find_policy(self.policy).polling), find_policy(self.policy).urgency,
+            int(self.policy == ROS2), find_policy(self.policy).urgency,
             self.dispatch_overhead_ns,
             self.switch_overhead_ns, self.judge_from, self.judge_until, self.cpus or NEVER,
             self.duration_ns,
@@ -153,7 +155,7 @@ def schedule(
     entries: list[LogEntry] = []
     busy: list[int] = []
     ended = run(
-        as_object(tables), state, empty(Deliveries), empty(Machine),
+        as_object(tables), state, empty(Pool), empty(Deliveries), empty(Machine),
         find_policy(settings.policy).key, as_lists(load), orders, busy, entries, progress)
     return Scheduled(ended, entries, state.decisions, busy)
 

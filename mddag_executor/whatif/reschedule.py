@@ -17,8 +17,7 @@ from typing import Any
 
 from mddag_executor.analysis.as_recorded import recording_result, Replay
 from mddag_executor.analysis.usage import share
-from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, POLICIES, processes_of, Tables, Tally
-from mddag_executor.core import policy as find_policy
+from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, processes_of, Tables, Tally
 from mddag_executor.core.tables import DEMOTE, ON_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
@@ -33,6 +32,7 @@ from mddag_executor.results.replays import (
 )
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.load import SKIPPED
+from mddag_executor.simulate.policies import ALL_POLICIES, preempts, ROS2
 from mddag_executor.simulate.workload import with_execution_times
 from mddag_executor.sources.open import Given, open_recording, Progress, undeclared
 from mddag_executor.text import counted, listed
@@ -172,7 +172,7 @@ def reschedule(
 
     :param path: a trace of this executor, or a recording.
     :param task_set: the declaration to schedule by; None: the one in the trace.
-    :param policy: a row of ``mddag_executor.core.POLICIES``; None: as recorded.
+    :param policy: a row of ``mddag_executor.simulate.ALL_POLICIES``; None: as recorded.
     :param workers: size of the pool of each process; None: as recorded.
     :param preemptive: whether a smaller key preempts a larger one; None: as recorded, if the
         policy supports it.
@@ -193,7 +193,7 @@ def reschedule(
     :raises mddag_executor.errors.MddagError: for an invalid policy or number of workers.
     """
     if policy is not None:
-        find_policy(policy).mode(bool(preemptive))
+        preempts(policy, preemptive or False)
     if workers is not None and not 1 <= workers <= MOST_WORKERS:
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
     run = path if isinstance(path, Recording) else open_recording(
@@ -204,7 +204,7 @@ def reschedule(
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
     cpus = cpus or head.cpus or None
     if preemptive is None:
-        preemptive = head.preemptive and not find_policy(policy).polling
+        preemptive = head.preemptive and policy != ROS2
     if on_late is None:     # any other number is damage
         on_late = next((name for name, n in ON_LATE.items() if n == head.on_late), 'continue')
     tables_of = partial(
@@ -224,12 +224,12 @@ def reschedule(
         tables = tables_of(with_execution_times(run.task_set, builder.times()))
     tables = tables._replace(process=[*_processes(run, placed), 1])
     notes = []
-    if given is None and len(placed) > 1 and find_policy(policy).polling:
+    if given is None and len(placed) > 1 and policy == ROS2:
         notes.append(
             f'{run.name}: rescheduled with policy fifo, because {policy} (polling) is known of '
             'one process only: choose another with --policy')
         policy = 'fifo'
-    find_policy(policy).mode(preemptive, len(placed))
+    preempts(policy, preemptive, len(placed))
     with gc_paused():
         work = builder.build(overheads, tables.process, workers if workers < each else NEVER)
     if work.unknown:
@@ -293,10 +293,10 @@ def _settings(
     """Return policy and workers as requested, otherwise as recorded."""
     if policy is None:
         policy = head.policy
-        if policy not in POLICIES:
+        if policy not in ALL_POLICIES:
             raise ReplayError(
                 name, f"it was recorded with policy '{policy}', which this version does not have",
-                f'give --policy, one of {", ".join(POLICIES)}')
+                f'give --policy, one of {", ".join(ALL_POLICIES)}')
     if workers is None:
         workers = head.workers
         if not 1 <= workers <= MOST_WORKERS:

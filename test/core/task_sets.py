@@ -11,8 +11,17 @@ from dataclasses import dataclass
 import json
 
 from hypothesis import strategies as st
-from mddag_executor.core import POLICIES, Scheduler, Tables
-from mddag_executor.simulate import END, periodic_load, PREEMPT, Settings, simulate, START
+from mddag_executor.core import Scheduler, Tables
+from mddag_executor.simulate import (
+    ALL_POLICIES,
+    END,
+    periodic_load,
+    PREEMPT,
+    Settings,
+    simulate,
+    START,
+)
+from mddag_executor.simulate.policies import ROS2
 from msg_graph import loads, TaskSet
 
 TICK = 1_000
@@ -181,11 +190,11 @@ def task_sets(
 
 
 @st.composite
-def cases(draw, /, policies=tuple(POLICIES), overheads=False, **options):
+def cases(draw, /, policies=tuple(ALL_POLICIES), overheads=False, **options):
     """Draw a task set and how to run it."""
     task_set = draw(task_sets(**options))
     policy = draw(st.sampled_from(policies))
-    preemptive = draw(st.booleans()) and not POLICIES[policy].polling
+    preemptive = draw(st.booleans()) and policy != ROS2
     most = draw(st.sampled_from([2, 5, 9]))  # light load to overload
     ticks = tuple(
         tuple(draw(st.lists(st.integers(1, most), min_size=len(dag.vertices),

@@ -194,14 +194,13 @@ class LiveDriver(RuleBasedStateMachine):
                 and not (run.holds and any(self.key(holder)[0] <= self.key(run)[0]
                                            for holder in holders))]
         if x < 0:
-            assert not self.polled(able), 'a worker idles while something may run'
+            assert not able, 'a worker idles while something may run'
             return
         run = self.by_x[x]
         assert run in able
-        if not self.scheduler.policy.polling:  # what waits for the next poll may be smaller
-            # the queue that it has left may be late as well: it is checked when it comes first
-            others = [other for other in able if other is run or other not in self.queue(run)]
-            assert self.key(run) <= min(map(self.key, others)), 'a smaller key waits'
+        # the queue that it has left may be late as well: it is checked when it comes first
+        others = [other for other in able if other is run or other not in self.queue(run)]
+        assert self.key(run) <= min(map(self.key, others)), 'a smaller key waits'
         run.fate, run.began, run.owns = RUNNING, True, True
         worker = self.state.x_worker[x]
         assert worker in idle
@@ -442,21 +441,6 @@ class LiveDriver(RuleBasedStateMachine):
             other is not run and other.owns and other.group == run.group
             for other in self.alive())
 
-    def polled(self, runs):
-        """Return those that a poll would find: not what waits behind another one of its entity."""
-        if not self.scheduler.policy.polling:
-            return runs
-        waiting = [run for run in self.runs if run.fate == WAITING]
-        return [
-            run for run in runs if run.vertex == self.tables.n_vertices or not any(
-                self.subscription(other) == self.subscription(run)
-                for other in waiting[:waiting.index(run)])]
-
-    def subscription(self, run):
-        """Return the entity of the message that started a run."""
-        tables = self.tables
-        return tables.entity[run.vertex] + tables.leg_topic[tables.first_leg[run.vertex] + run.leg]
-
     def region(self, dag, slot):
         base = self.state.job_base[slot]
         return range(base, base + self.tables.n_region[dag])
@@ -526,15 +510,15 @@ def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits():
 
 
 def test_dropped_executions_leave_the_queues():
-    """Memory is bounded, the length is right, and the entity is polled once for each round."""
+    """Memory is bounded, and the length is right."""
     core = live(declaration([
-        {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us'}]), policy_name='ros2')
+        {'node': '/n', 'name': 'tick', 'timer': '10us', 'deadline': '10us'}]))
     kept = core.source(core.release(0, 0, 0, 0))
     queue = core.new_queue()
     for i in range(200):
         core.drop(core.ready_undeclared(i, -1, 0, queue if i % 2 else -1, 0), 0)
     core.ready(kept, 1)
-    assert core.queue_length == len(core.state.unpolled) == 1 and not core.state.ready
+    assert core.queue_length == len(core.state.ready) == 1
     assert core.take(0, 2) == kept
     core.complete(kept, 3)
     assert (core.take(0, 4), core.queue_length) == (-1, 0)

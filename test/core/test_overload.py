@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the core does in an overload, and that it does nothing without one (rules 7, 13, 14)."""
+"""What the core does in an overload, and that it does nothing without one (rules 7, 11, 12)."""
 
 from dataclasses import replace
 

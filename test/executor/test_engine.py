@@ -26,7 +26,7 @@ from .declared import graph
 
 HORIZON = 60
 MS = 1_000_000
-PLAIN = tuple(name for name, policy in POLICIES.items() if not policy.polling)
+
 
 
 def new_engine(task_set=None, workers=1, policy='rad', **more):
@@ -108,7 +108,7 @@ class Driver:
 
 
 @examples(150)
-@given(cases(policies=PLAIN, groups=False, bounds=False))
+@given(cases(policies=tuple(POLICIES), groups=False, bounds=False))
 def test_the_same_events_give_the_same_answers_as_the_simulator(case):
     # A sync is one execution for each message here, and one in all there.
     assume(all(len(v.predecessors) <= 1 for d in case.task_set.dags for v in d.vertices))

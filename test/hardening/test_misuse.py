@@ -20,7 +20,7 @@ nodes: [{node: /n, callbacks: [{name: tick, timer: 10ms, deadline: 10ms, dag: d}
 
 WRONG = {
     'graph': (42, {'mddag': 1}), 'num_workers': ('7', 0, -1, 2.5, 4097), 'num_threads': ('7', 0),
-    'policy': (None, 'x', []), 'max_active_jobs': (0,), 'worker_priority': (5,),
+    'policy': (None, 'x', [], 'ros2'), 'max_active_jobs': (0,), 'worker_priority': (5,),
     'default_deadline': (None, 1.5, 0, 10**30, Duration(seconds=-1), 'soon', '', '5', '1 parsec'),
     'worker_policy': (5, '__class__', 'sched_yield'),
     'worker_cpus': ('0', {'a'}, set(), {10**6}, 3), 'on_deadline_miss': (3, 'print'),

@@ -12,10 +12,11 @@ import random
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import POLICIES, Tables, Tally
+from mddag_executor.core import Tables, Tally
 from mddag_executor.laboratory.experiment import judge_of
 from mddag_executor.simulate import compiled, schedule, Settings, simulate
 from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
+from mddag_executor.simulate.policies import ROS2
 import numpy as np
 import pytest
 
@@ -110,7 +111,7 @@ def with_everything(load_, tables, chances):
 @given(EVERY_RULE, st.integers(5, 60), st.booleans(), st.integers(0, 2 ** 32))
 def test_machine_messages_and_processes(case, horizon, stop, seed):
     chances = random.Random(seed)
-    one = case.preemptive or POLICIES[case.policy].polling
+    one = case.preemptive or case.policy == ROS2
     settings = replace(
         settings_of(case, horizon * SLOW, 'horizon', stop),
         processes=1 if one else chances.randint(1, 3), cpus=chances.choice([None, 1, 2, 3]))

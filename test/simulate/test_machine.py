@@ -229,6 +229,8 @@ def some_jobs(draw):
 @examples(400)
 @given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans(), st.booleans())
 def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, divided):
+    for job in jobs:  # processes with a pool of their own have an interpreter of their own
+        job.interpreter = job.interpreter if divided else 1
     with pytest.MonkeyPatch.context() as patch:
         for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('TAIL_NS', TAIL)):
             patch.setattr(machine, name, ticks)
