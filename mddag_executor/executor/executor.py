@@ -48,7 +48,6 @@ from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import short_switch_interval
 from mddag_executor.executor.loop import raise_limit
 from mddag_executor.executor.misses import MissNotifier
-from mddag_executor.executor.name_check import NameCheck
 from mddag_executor.executor.outer_groups import outer_here, OuterGroup
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
@@ -221,12 +220,12 @@ class MultiDeadlineExecutor(BareExecutor):
     ) -> None:
         """Make the parts that need the context."""
         process = self._process
-        self._registry = Registry(task_set, self._engine, self._pool.leave_group)
+        self._registry = Registry(
+            task_set, self._engine, self._pool.leave_group, self._recorder)
         self._new_tasks: deque[Work] = deque()
         self._task_entities = TaskEntities()
         if self._recorder is not None:
             self._recorder.entities((), [self._task_entities.others])
-        self._names = NameCheck(task_set, self._registry, process)
         self._announcements: Announcements | None = None
         self._check_at: list[float] = []  # when to check again whether the context has ended
         super().__init__(context=context)
@@ -235,7 +234,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._pool, self.signal_guard(), weakly(self._signalled))
         self._upkeep = self._ending.upkeep = Upkeep(
             weakly(self._nodes_to_serve), self._registry, self._pool, self._at_once,
-            self._recorder, self._wait_sets)
+            self._wait_sets)
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
             self._diagnostics = self._ending.diagnostics = Diagnostics(
@@ -506,7 +505,8 @@ class MultiDeadlineExecutor(BareExecutor):
             if self._was_ended():
                 return
             self._submit_tasks()
-            self._names.check(self._engine.is_judging)
+            self._registry.bindings.check(
+                self._registry.by_id, self._engine.is_judging, self._process)
             rest = self._upkeep.rest_s()
             if rest == 0.0:
                 self._upkeep.refresh()
@@ -526,7 +526,7 @@ class MultiDeadlineExecutor(BareExecutor):
     def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
         """Return for how long the spinning thread waits at most; None: until a wake-up."""
         now = time.monotonic()
-        times = [rest, self._unclaimed.rest_s(), self._names.rest_s()]
+        times = [rest, self._unclaimed.rest_s(), self._registry.bindings.rest_s()]
         times += [at - now for at in self._check_at if at > now]
         if deadline is not None:
             times.append(min(max(0.0, deadline - now), LONGEST_WAIT_S))

@@ -1,20 +1,44 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The registry of entities: the declared callback of each, and its callback group in the core."""
+"""
+The entities of the executor's nodes: how each appears, changes and disappears.
+
+Theory of operation
+-------------------
+Nodes notify an executor that their entities have changed (``Executor.wake``), but not how.  So
+``refresh`` compares the entities that the nodes have now with those that it knows::
+
+    a node makes it                                       a node destroys it, or is removed
+          │                                                               │
+          ▼                                                               ▼
+       appears ──────────────────▶ is there ────────────────────────▶ disappears
+          │                         │    ▲                                │
+          │ describe (``kinds``)    └────┘                                │ its callback is free
+          │ its callback group     changes: its node moves                │ again; its executions
+          │ (``groups``)           to another outer group                 │ that wait are dropped
+          │ its declared callback                                         ▼
+          │ (``bindings``)                                             retired
+          │ its tracepoints           until its last execution has ended; then only
+          ▼ (``recorder``)            its counts are kept, by the name of its callback
+       it listens (``upkeep``);
+       in a rerun nothing does
+
+Live runs and reruns share all of this but for listening.  ``upkeep`` decides when to refresh.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
 import threading
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 import weakref
 
-from mddag_executor.core.jobs import source_depth
-from mddag_executor.executor.bounds import REMEMBERED
+from mddag_executor.executor.bindings import Bindings
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.entity import COUNTS, link
+from mddag_executor.executor.entity import COUNTS
+from mddag_executor.executor.groups import CallbackGroups
 from mddag_executor.executor.kinds import Kind
+from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.sources import (
     ClientEntity,
     ClockEntity,
@@ -23,9 +47,8 @@ from mddag_executor.executor.sources import (
 )
 from mddag_executor.executor.timers import TimerEntity
 from mddag_executor.executor.waitables import EventEntity, GuardEntity, WaitableEntity
-from mddag_executor.executor.work import decides_itself, step_in_group, Work
-from msg_graph import binding, Callback, TaskSet
-from rclpy.callback_groups import ReentrantCallbackGroup
+from mddag_executor.executor.work import Work
+from msg_graph import TaskSet
 from rclpy.event_handler import EventHandler, QoSSubscriptionEventType
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
@@ -66,6 +89,13 @@ def _listed(node: Node, name: str) -> list[Any]:
     return found
 
 
+class Changes(NamedTuple):
+    """The entities that have appeared, and those that have disappeared."""
+
+    added: list[Kind]
+    gone: list[Kind]
+
+
 class Registry:
     """
     The records of all entities of the executor's nodes.
@@ -73,45 +103,39 @@ class Registry:
     It is refreshed under the engine's lock; other threads may look entities up and read counts at
     any time.
 
-    :ivar by_id: the ``Entity`` of each rclpy entity, by the ``id`` of the latter.
     :param passed: called with each execution that a callback group has let run (see ``work``).
+    :param recorder: of the trace; None: there is none.
+    :ivar by_id: the ``Entity`` of each rclpy entity, by the ``id`` of the latter.
+    :ivar outer_groups: the outer groups of nodes.
+    :ivar own: the executor's own subscriptions.
     """
 
     def __init__(
         self, task_set: TaskSet | None, engine: Engine, passed: Callable[[Work], None],
+        recorder: Recorder | None,
     ) -> None:
-        self._task_set = task_set
-        self._tables = engine.tables
         self._engine = engine
-        self._passed = passed
-        self._binder = binding.Binder(task_set) if task_set is not None else None
-        # the core's numbers of callback groups (of user-defined groups: of their entities), and
-        # all that are not freed yet
-        self._groups: weakref.WeakKeyDictionary[Any, int] = weakref.WeakKeyDictionary()
-        self._numbers: set[int] = set()
-        #: the outer groups of nodes
-        self.outer_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
-        self._counting = threading.Lock()
+        self._recorder = recorder
+        self._groups = CallbackGroups(engine, passed)
+        self.bindings = Bindings(task_set, engine)
         self.by_id: dict[int, Kind] = {}
-        # the executor's own subscriptions
         self.own: set[Any] = set()
+        self.outer_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
         # destroyed entities with unfinished executions, and the counts of earlier ones
+        self._counting = threading.Lock()
         self._retired: list[Kind] = []
         self._past: dict[str, dict[str, Any]] = {}
-        # by declared callback: the topics that its entities, also removed ones, have published
-        # (they share the set), and have got messages of
-        self._published: dict[str, set[str]] = {c.key: set() for c in self.declared}
-        self._received: dict[str, set[str]] = {c.key: set() for c in self.declared}
-        self._undeclared: dict[binding.Entity, None] = {}
         self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
 
-    @property
-    def declared(self) -> tuple[Callback, ...]:
-        """Return the declared callbacks."""
-        return self._task_set.callbacks if self._task_set is not None else ()
+    # --- the life of an entity -------------------------------------------------------------------
 
-    def refresh(self, found: EntitySet) -> tuple[list[Kind], list[Kind]]:
-        """Update the entities to those that the nodes have now; return new and removed ones."""
+    def refresh(self, found: EntitySet, now: int) -> Changes:
+        """
+        Update the entities to those that the nodes have now.
+
+        :param found: the ``snapshot`` of the nodes.
+        :param now: the engine's time.
+        """
         present: dict[int, Kind] = {}
         new: list[tuple[str, Any, str, int]] = []
         for node, lists in found.items():
@@ -123,26 +147,53 @@ class Registry:
             outer = -1 if group is None else group.number
             for list_name, some in zip(LISTS, lists):
                 for rclpy_entity in some:
-                    key = id(rclpy_entity)
-                    entity = self.by_id.get(key)
+                    entity = self.by_id.get(id(rclpy_entity))
                     if entity is None or entity.rclpy is not rclpy_entity:
                         new.append((list_name, rclpy_entity, name, outer))
                     else:
-                        present[key] = entity
-                        if entity.outer != outer:
-                            self._engine.move(entity, outer)
+                        present[id(rclpy_entity)] = entity
+                        self._change(entity, outer)
         gone = [each for key, each in self.by_id.items() if key not in present]
         for each in gone:  # first: a new one may be their callback's next entity
-            self._unbind(each)
-        made = [self._new_entity(*each) for each in new]
-        added = [each for each in made if each is not None]
+            self.bindings.unbind(each)
+        appeared = [self._appear(*each, now) for each in new]
+        added = [each for each in appeared if each is not None]
         present.update((id(each.rclpy), each) for each in added)
         with self._counting:
             self.by_id = present
             self._retired.extend(gone)
             self._fold()
-        self._free_groups()
-        return added, gone
+        self._groups.free()
+        engine = self._engine
+        if engine.other_processes is not None and (added or gone):
+            engine.other_processes.host(
+                self.hosted(), self.of_kind(SubscriptionEntity), engine.record, now)
+        for each in gone:
+            engine.remove(each, now)
+        if self._recorder is not None:
+            self._recorder.entities(found, added)
+        return Changes(added, gone)
+
+    def _appear(
+        self, list_name: str, rclpy_entity: Any, node: str, outer: int, now: int
+    ) -> Kind | None:
+        kind = next(each for each in KINDS
+                    if each.list_name == list_name and each.fits(rclpy_entity))
+        try:
+            entity = kind(rclpy_entity, node)
+            entity.describe()
+        except InvalidHandle:
+            return None  # destroyed after it was listed
+        entity.outer = outer
+        entity.since = now
+        entity.is_own = rclpy_entity in self.own
+        self._groups.enter(entity)
+        self.bindings.bind(entity)
+        return entity
+
+    def _change(self, entity: Kind, outer: int) -> None:
+        if entity.outer != outer:
+            self._engine.move(entity, outer)
 
     def _name(self, node: Any) -> str:
         """Return a node's name, even if it has been destroyed but not removed."""
@@ -151,71 +202,16 @@ class Registry:
             name = self._names[node] = node.get_fully_qualified_name()
         return name
 
-    def _fold(self) -> None:
-        """Keep only the counts of retired entities without executions: memory is bounded."""
-        retired, self._retired = self._retired, []
-        for entity in retired:
-            if entity.is_through():
-                entity.count_into(self._past)
-                self._note_received(entity)
-            else:
-                self._retired.append(entity)
-
-    def publishes(self) -> dict[str, set[str]]:
-        """Return on which topics each declared callback has published."""
-        return {key: set(topics) for key, topics in self._published.items()}
-
-    def came(self) -> dict[str, set[str]]:
-        """Return of which topics each sync has got messages."""
-        with self._counting:
-            for entity in (*self._retired, *self.by_id.values()):
-                self._note_received(entity)
-            return {c.key: set(self._received[c.key]) for c in self.declared if c.kind == 'sync'}
-
-    def _note_received(self, entity: Kind) -> None:
-        if entity.callback is not None and entity.ready:
-            self._received[entity.callback.key].add(entity.topic)
-
-    def counts(self) -> dict[str, dict[str, Any]]:
-        """Return the counts of all entities, also removed ones, by callback (see ``Entity``)."""
-        with self._counting:
-            counts = {name: dict(past) for name, past in self._past.items()}
-            for entity in (*self._retired, *self.by_id.values()):
-                entity.count_into(counts)
-        return counts
-
-    def computing(self) -> int:
-        """Return how many of the callbacks that have run hold the interpreter."""
-        return sum(bool(e.ran and e.habit.holds) for e in list(self.by_id.values()))
-
-    def totals(self) -> dict[str, int]:
-        """Return the sums of the counts of all callbacks, from any thread."""
-        every = self.counts().values()
-        return {key: sum(each[key] for each in every) for key in COUNTS}
-
-    def hosted(self) -> set[str]:
-        """Return the keys of the declared callbacks that an entity is bound to now."""
-        return {
-            entity.callback.key for entity in self.by_id.values()
-            if entity.callback is not None}
-
-    def elsewhere(self, process: str | None) -> set[str]:
-        """Return the declared callbacks that run in other processes."""
-        if self._task_set is None or process is None:
-            return set()
-        return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
-
-    def unbound(self) -> list[Callback]:
-        """Return the declared callbacks that no entity is bound to now."""
-        return [] if self._binder is None else self._binder.unbound()
-
-    def undeclared(self) -> list[binding.Entity]:
-        """Return all undeclared timers, subscriptions and services, including removed ones."""
-        return list(self._undeclared)
+    # --- those that there are --------------------------------------------------------------------
 
     def of_kind(self, kind: type[SomeKind]) -> list[SomeKind]:
         """Return the current entities of a kind."""
         return [entity for entity in list(self.by_id.values()) if isinstance(entity, kind)]
+
+    def hosted(self) -> set[str]:
+        """Return the keys of the declared callbacks that an entity is bound to now."""
+        return {entity.callback.key for entity in list(self.by_id.values())
+                if entity.callback is not None}
 
     def note_event(self, handler: EventHandler, status: Any) -> None:
         """Note a QoS event: the policy because of which a subscription gets no messages."""
@@ -226,70 +222,38 @@ class Registry:
             if handler in entity.rclpy.event_handlers:
                 entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
-    def _new_entity(
-        self, list_name: str, rclpy_entity: Any, node: str, outer: int
-    ) -> Kind | None:
-        kind = next(each for each in KINDS
-                    if each.list_name == list_name and each.fits(rclpy_entity))
-        try:
-            entity = kind(rclpy_entity, node)
-            entity.describe()
-        except InvalidHandle:
-            return None  # destroyed after it was listed
-        entity.outer = outer
-        entity.is_own = rclpy_entity in self.own
-        self._set_group(entity)
-        self._bind(entity)
-        return entity
+    # --- counts ----------------------------------------------------------------------------------
 
-    def _set_group(self, entity: Kind) -> None:
-        """Set the callback group of a new entity."""
-        rclpy_entity = entity.rclpy
-        group = getattr(rclpy_entity, 'callback_group', None)
-        decides = group is not None and decides_itself(group)
-        entity.group = self._number(rclpy_entity if decides else group)
-        if decides:
-            entity.gate = partial(step_in_group, group, rclpy_entity, self._passed)
-        elif group is not None and entity.group >= 0 and group.has_entity(rclpy_entity):
-            entity.exclusive = group
+    def _fold(self) -> None:
+        """Keep only the counts of retired entities without executions: memory is bounded."""
+        retired, self._retired = self._retired, []
+        for entity in retired:
+            if entity.is_through():
+                entity.count_into(self._past)
+                self.bindings.note_received(entity)
+            else:
+                self._retired.append(entity)
 
-    def _bind(self, entity: Kind) -> None:
-        """Bind a new entity to its declared callback, if there is one."""
-        declarable = entity.declarable
-        if declarable is None:
-            return
-        callback = None if self._binder is None else self._binder.bind(declarable)
-        if callback is None:
-            if not entity.is_own and len(self._undeclared) < REMEMBERED:
-                self._undeclared[declarable] = None
-            return
-        assert self._task_set is not None
-        entity.declare(callback)
-        link(entity, self._task_set, self._tables)
-        entity.awaiting = self._engine.awaiting.get(callback.key)
-        entity.publishes = self._published[callback.key]
-        if entity.is_due_at_release and entity.source >= 0:
-            scheduler = self._engine.scheduler
-            entity.depth = source_depth(
-                scheduler.tables, scheduler.state, self._tables.dag_of[entity.source])
+    def counts(self) -> dict[str, dict[str, Any]]:
+        """Return the counts of all entities, also removed ones, by callback (see ``Entity``)."""
+        with self._counting:
+            counts = {name: dict(past) for name, past in self._past.items()}
+            for entity in (*self._retired, *self.by_id.values()):
+                entity.count_into(counts)
+        return counts
 
-    def _number(self, group: Any) -> int:
-        """Return the core's number of a callback group, -1 for a reentrant one and for none."""
-        if group is None or isinstance(group, ReentrantCallbackGroup):
-            return -1
-        number = self._groups.get(group)
-        if number is None:
-            number = self._groups[group] = self._engine.scheduler.new_group()
-            self._numbers.add(number)
-        return number
+    def totals(self) -> dict[str, int]:
+        """Return the sums of the counts of all callbacks, from any thread."""
+        every = self.counts().values()
+        return {key: sum(each[key] for each in every) for key in COUNTS}
 
-    def _free_groups(self) -> None:
-        """Free the numbers of destroyed groups: memory is bounded."""
-        if len(self._groups) < len(self._numbers):
-            for number in self._numbers.difference(list(self._groups.values())):
-                self._numbers.remove(number)
-                self._engine.scheduler.free_group(number)
+    def computing(self) -> int:
+        """Return how many of the callbacks that have run hold the interpreter."""
+        return sum(bool(e.ran and e.habit.holds) for e in list(self.by_id.values()))
 
-    def _unbind(self, entity: Kind) -> None:
-        if self._binder is not None and entity.callback is not None:
-            self._binder.release(entity.callback, entity.topic or None)
+    def received(self) -> dict[str, set[str]]:
+        """Return of which topics each sync has got messages."""
+        with self._counting:
+            for entity in (*self._retired, *self.by_id.values()):
+                self.bindings.note_received(entity)
+            return self.bindings.received()

@@ -28,9 +28,9 @@ def statistics(
         undeclared = engine.undeclared
         requirements = engine.requirements(pool.clock.now())
         elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
-    elsewhere |= registry.elsewhere(process)
+    elsewhere |= registry.bindings.elsewhere(process)
     callbacks = cast('dict[str, CallbackCounts]', registry.counts())
-    never_ran = [c.key for c in registry.declared
+    never_ran = [c.key for c in registry.bindings.declared
                  if c.key not in elsewhere
                  and (c.key not in callbacks or not callbacks[c.key]['ran'])]
     for dag in result['dags'].values():  # their sinks are judged in their own processes

@@ -1,11 +1,12 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Keeps registry, sources and trace up to date with the nodes' entities.
+Keeps the registry of a live executor up to date, and lets its entities listen.
 
-Nodes notify the executor that their entities have changed (``Executor.wake``), but not how.  So
-the spinning thread refreshes everything at once; when many entities are made in a row, not for
-each of them.
+The spinning thread refreshes everything at once (``registry``); when many entities are made in a
+row, it does not refresh for each of them.  An entity listens from its appearance until it
+disappears.  If a node is removed while nothing spins, its entities only stop listening: the node
+may be added again before the next spin.
 """
 
 from __future__ import annotations
@@ -21,9 +22,7 @@ from mddag_executor.executor import publishing
 from mddag_executor.executor.at_once import AtOnce
 from mddag_executor.executor.compat import alive, publisher_ids
 from mddag_executor.executor.kinds import Kind, Rooms
-from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry, snapshot
-from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.waitables import (
     EventsSource,
     SharedSource,
@@ -36,7 +35,7 @@ from rclpy.exceptions import InvalidHandle
 
 class Upkeep:
     """
-    The entities of the executor's nodes, as sources.
+    The entities of the executor's nodes, as they listen.
 
     :param nodes: returns the nodes.
     :ivar changed: whether there may be new or removed entities (see ``change``).
@@ -44,14 +43,13 @@ class Upkeep:
 
     def __init__(
         self, nodes: Callable[[], list[Any]], registry: Registry, pool: WorkerPool,
-        at_once: AtOnce, recorder: Recorder | None, wait_sets: WaitSetThread,
+        at_once: AtOnce, wait_sets: WaitSetThread,
     ) -> None:
         self.changed = True
         self._nodes = nodes
         self._living: list[weakref.ref[Any]] = []
         self._registry = registry
         self._pool = pool
-        self._recorder = recorder
         self._rooms = Rooms(
             pool, at_once, self._publishers, publishing.Deliveries(pool),
             SharedSource(partial(EventsSource, registry.note_event), pool, wait_sets),
@@ -99,25 +97,14 @@ class Upkeep:
             self._apply()
 
     def _refresh(self) -> None:
-        pool, registry, engine = self._pool, self._registry, self._pool.engine
+        pool, registry = self._pool, self._registry
         nodes = self._nodes()
         self._living = [weakref.ref(node) for node in nodes]
         found = snapshot(nodes)
         with pool.lock:
-            now = pool.tick()
-            added, gone = registry.refresh(found)
-            lost = set(gone)
-            back = [each for each in self._silent if each not in lost]
-            self._silent = []
-            if engine.other_processes is not None and (added or gone):
-                engine.other_processes.host(
-                    registry.hosted(), registry.of_kind(SubscriptionEntity), engine.record, now)
-            for entity in gone:
-                engine.remove(entity, now)
-            if self._recorder is not None:
-                self._recorder.entities(nodes, added)
-            for entity in added:
-                entity.since = now
+            added, gone = registry.refresh(found, pool.tick())
+        back = [each for each in self._silent if not each.removed]
+        self._silent = []
         for entity in gone:
             self._ignore(entity)
         for entity in (*added, *back):

@@ -48,7 +48,7 @@ class Watch:
             releases=dict(zip(sources, self._releases)),
             got={key: count['ready'] for key, count in counts.items()},
             ran={key: count['ran'] for key, count in counts.items()},
-            came={**self._executor._registry.came()},
-            publishes={**self._executor._registry.publishes()},
+            came={**self._executor._registry.received()},
+            publishes={**self._executor._registry.bindings.published()},
             nodes={key.rpartition(':')[0] for key in counts},
-            undeclared=self._executor._registry.undeclared())
+            undeclared=self._executor._registry.bindings.undeclared())

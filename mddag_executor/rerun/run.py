@@ -25,7 +25,6 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE_JOBS
 from mddag_executor.executor import publishing
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.name_check import unbound_text
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry, snapshot
@@ -151,7 +150,7 @@ class Rerun:
             task_set, self._workers, self.policy, default_deadline=DEFAULT_DEADLINE_NS,
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
             record=None if writer is None else writer.record)
-        engine.other_processes = self._other_processes = OtherProcesses(
+        engine.other_processes = OtherProcesses(
             task_set, engine.tables, engine.scheduler, engine.jobs, task_set.dags)
         # the callbacks that hold the interpreter, declared or else recorded
         self._holders = {
@@ -171,7 +170,7 @@ class Rerun:
                 MAX_ACTIVE_JOBS, clock, writer, self.cpus or 0,
                 on_late=engine.on_late)
             self._recorder.entities((), [self._holder.task_entity])
-        self._registry = Registry(task_set, engine, engine.leave_group)
+        self._registry = Registry(task_set, engine, engine.leave_group, self._recorder)
         self._messages = Messages(loop, recording, self.times, self._outputs, clock)
         self._requests = Requests(loop, self._holder, self._registry)
         self._timers = Timers(loop, self.times.first_release)
@@ -206,14 +205,9 @@ class Rerun:
     def _refresh(self) -> None:
         nodes = self._holder.ordered_nodes()
         registry, engine, now = self._registry, self._engine, self._loop.now
-        added, gone = registry.refresh(snapshot(nodes))
-        hosted = registry.hosted()
-        self._hosted |= hosted
-        if added or gone:
-            self._other_processes.host(
-                hosted, registry.of_kind(SubscriptionEntity), engine.record, now)
+        added, _ = registry.refresh(snapshot(nodes), now)
+        self._hosted |= registry.hosted()
         for entity in added:
-            entity.since = now
             if entity.rclpy in self._triggered:
                 self._triggered.remove(entity.rclpy)
                 engine.ready(Work(entity, entity.rclpy.callback), now)
@@ -222,11 +216,7 @@ class Rerun:
             if isinstance(entity, WaitableEntity) and not self._requests.knows(entity.rclpy):
                 self._loop.warn(
                     f'{entity.name}: a waitable of its own kind, which never gets ready')
-        for entity in gone:
-            engine.remove(entity, now)
         self._timers.refresh(registry.of_kind(TimerEntity))
-        if self._recorder is not None:
-            self._recorder.entities(nodes, added)
         self._messages.refresh(nodes, added, registry.of_kind(SubscriptionEntity))
 
     # --- the run ---------------------------------------------------------------------------------
@@ -312,7 +302,7 @@ class Rerun:
         self._messages.begin()
 
     def _none_hosted(self) -> str:
-        text = unbound_text(self.task_set, self._registry.unbound(), self._registry)
+        text = self._registry.bindings.unbound_text(self._registry.by_id.values())
         return f'{text}: give the nodes that it declares, with the same names'
 
     # --- the end ---------------------------------------------------------------------------------

@@ -241,7 +241,7 @@ CAMERA = graph(
      '(subscription /robot/image): ')])
 def test_a_wrong_name_is_warned_of_once(
         make_executor, make_node, capfd, monkeypatch, node, topic, expected):
-    monkeypatch.setattr('mddag_executor.executor.name_check.LEAST_S', 0.3)
+    monkeypatch.setattr('mddag_executor.executor.bindings.LEAST_S', 0.3)
     camera, detector, heard = make_node(node), make_node('detector'), []
     publisher = camera.create_publisher(String, topic, 10)
 

@@ -118,8 +118,8 @@ may not check
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-True]'),
         every=True),
     Case('groups_ignored', [(
-        'executor/registry.py', 'self._number(rclpy_entity if decides else group)', '-1'), (
-        'executor/registry.py', 'entity.exclusive = group', 'pass')], of(
+        'executor/groups.py', 'self._number(rclpy_entity if decides else group)', '-1'), (
+        'executor/groups.py', 'entity.exclusive = group', 'pass')], of(
         'test_executor.py', 'test_mutually_exclusive_group_is_kept')),
     Case('rad_is_fifo', [(
         'core/policies.py', "Policy('rad', key_rad,", "Policy('rad', key_fifo,")], of(
@@ -146,7 +146,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_a_callback_that_has_lent_its_worker_goes_on_in_order[1]',
         'test_a_callback_that_has_lent_its_worker_goes_on_in_order[7]'), every=True),
     Case('groups_of_other_executors_ignored', [(
-        'executor/registry.py', 'entity.exclusive = group', 'pass')], of(
+        'executor/groups.py', 'entity.exclusive = group', 'pass')], of(
         'test_executor.py',
         'test_a_mutually_exclusive_group_is_kept_though_its_node_moves[own]',
         'test_a_mutually_exclusive_group_is_kept_though_its_node_moves[rclpy]',
