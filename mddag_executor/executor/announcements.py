@@ -6,8 +6,8 @@ Announcements of publications between the executors of one machine.
 Theory of operation
 -------------------
 A message carries its source timestamp and publication sequence number, but not its job.  Within a
-process the time window of each publication is noted (``jobs``).  A process that publishes for
-another one announces the same, right after the message, on a separate topic: topic, window,
+process the time window of each publication is noted (``attribution``).  A process that publishes
+for another one announces the same, right after the message, on a separate topic: topic, window,
 sequence number, and job.  Both processes have the same system clock.
 
 1.  *Announced* is each publication on a topic by which a DAG leaves the process, for the DAGs that
@@ -22,8 +22,8 @@ sequence number, and job.  Both processes have the same system clock.
     announcement: for ``WAIT_NS`` at least, and until the next check, as the process may just have
     been stopped.  Then it runs as undeclared, and is counted.  Publications of one publisher are
     announced in order, so its messages stay in order.
-4.  Announced publications are looked up with those of this process, by one rule (``Jobs.find``):
-    window and sequence number.
+4.  Announced publications are looked up with those of this process, by one rule
+    (``Attribution.find``): window and sequence number.
 5.  *Announcements come from outside.*  One that cannot be true (an unknown vertex or topic, a
     release in the future or long ago) is ignored.  They are handled before all callbacks, so they
     get a twentieth of a core at most; those beyond that are ignored as well, with a warning.
@@ -45,8 +45,7 @@ import struct
 import time
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor.executor.bounds import LOG_EVERY_S, REMEMBERED
-from mddag_executor.executor.jobs import (
+from mddag_executor.executor.attribution import (
     Announced,
     NO_ORIGIN,
     Origin,
@@ -54,6 +53,7 @@ from mddag_executor.executor.jobs import (
     PublisherNumbers,
     stamped_release,
 )
+from mddag_executor.executor.bounds import LOG_EVERY_S, REMEMBERED
 from mddag_executor.executor.other_processes import contested
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.work import Work
@@ -93,7 +93,7 @@ class Announcements:
 
     def __init__(self, task_set: TaskSet, process: str, pool: WorkerPool) -> None:
         self._pool = pool
-        self._jobs = pool.engine.jobs
+        self._attribution = pool.engine.attribution
         self._engine = pool.engine
         self._clock = pool.clock
         self._topics = sorted({t for c in task_set.callbacks for t in c.publishes})
@@ -121,7 +121,7 @@ class Announcements:
                 UInt8MultiArray, f'/mddag/jobs_{digest}/p{i}', self._hear, _QOS,
                 callback_group=ReentrantCallbackGroup())
             for i in range(len(names)) if i != own]
-        self._jobs.announce = self._announce
+        self._attribution.announce = self._announce
         self._engine.on_silent = self._announce_silent
 
     def unmatched(self) -> list[str]:
@@ -136,7 +136,7 @@ class Announcements:
 
     def close(self) -> None:
         """Stop announcing."""
-        self._jobs.announce = None
+        self._attribution.announce = None
         self._engine.on_silent = None
         self._publisher = None
         self.node.destroy_node()
@@ -165,9 +165,11 @@ class Announcements:
         job, publisher = self._job(origin), self._publisher
         if job is not None and publisher is not None and topic not in self._contested:
             (home, number), release = job
-            self._pool.deferred.append(partial(publisher.publish, UInt8MultiArray(data=_ENTRY.pack(
+            entry = _ENTRY.pack(
                 self._token, 0, SILENT, 0, 0, home, number, release, origin.dag, origin.vertex,
-                self._number[topic]))))
+                self._number[topic])
+            self._pool.unlocked_calls.append(
+                partial(publisher.publish, UInt8MultiArray(data=entry)))
 
     def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
         """Return name and release of a job; None: no job, or it has ended meanwhile."""
@@ -216,7 +218,7 @@ class Announcements:
             return True
         if now > self._warn_at:
             self._warn_at = now + int(LOG_EVERY_S * 1e9)
-            self._pool.deferred.append(partial(
+            self._pool.unlocked_calls.append(partial(
                 get_logger('mddag_executor').warning,
                 'announcements of jobs are ignored: more arrive than the executors of the '
                 'declared processes can send; another program publishes on '
@@ -252,20 +254,20 @@ class Announcements:
         self._publishers[whose, of] = publisher  # the latest is last
         if len(self._publishers) > REMEMBERED:
             del self._publishers[next(iter(self._publishers))]
-        self._jobs.note_announced(self._topics[topic], Publication(
+        self._attribution.note_announced(self._topics[topic], Publication(
             begin, publisher, Announced((home, number), dag, vertex, release), sequence, end))
 
     def _find(
         self, work: Work, info: dict[str, Any], counted: bool = False
     ) -> Origin | Announced | None:
-        return self._jobs.find(
+        return self._attribution.find(
             work.entity.topic, info['source_timestamp'],
             info.get('publication_sequence_number'), counted)
 
     def take(self, work: Work, info: dict[str, Any], now: int) -> None:
         """Handle a message that may be of another process; pass it on when its job is known."""
         if work.entity.topic in self._contested:
-            self._jobs.doubtful += 1
+            self._attribution.doubtful += 1
             self._give(work, None)
             return
         origin = self._find(work, info)

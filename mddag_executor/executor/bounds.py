@@ -15,15 +15,15 @@ While a callback runs that usually takes no longer than this, no other thread is
 Waking a thread costs 60 to 140 us while a callback computes.
 """
 
-GUARD_NS = 4_000_000
+PATIENCE_NS = 4_000_000
 """
 The longest that a ready callback waits because another one was expected to end.
 
-It is less if the ready one is urgent: its relative deadline by ``GUARD_PART``, but not less than
-twice the duration of a short callback.
+It is less if the ready one is urgent: its relative deadline by ``PATIENCE_PART``, but not less
+than twice the duration of a short callback.
 """
 
-GUARD_PART = 25
+PATIENCE_PART = 25
 
 NET_NS = 20_000_000
 """While a short callback runs longer than expected, arrivals stay unnoticed for this at most."""

@@ -297,7 +297,7 @@ class PoolWatch:
         self._at = time.monotonic_ns(), time.process_time_ns()
 
     def _read(self) -> dict[str, int]:
-        jobs = self._engine.jobs
+        jobs = self._engine.attribution
         return {
             **self._registry.totals(), 'doubtful': jobs.doubtful,
             'trace_lost': 0 if self._recorder is None else self._recorder.writer.dropped,

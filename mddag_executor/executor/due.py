@@ -28,9 +28,9 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
-    GUARD_NS,
     LOOK_PART,
     NET_NS,
+    PATIENCE_NS,
     QUIET_NS,
     SOON_NS,
     STOP_NS,
@@ -49,7 +49,7 @@ class Clocked(Threads, Protocol):
     loop: EventLoop
     parking: Parking
     timers: TimerQueue
-    deferred: deque[Callable[[], None]]
+    unlocked_calls: deque[Callable[[], None]]
     running: bool
     is_stepping: bool
     polling: int
@@ -63,14 +63,16 @@ class Clocked(Threads, Protocol):
 class Call:
     """A call at a time, which waits until the lock is free."""
 
-    def __init__(self, deferred: deque[Callable[[], None]], function: Callable[[], None]) -> None:
+    def __init__(
+        self, unlocked_calls: deque[Callable[[], None]], function: Callable[[], None]
+    ) -> None:
         self.entry: list[Any] | None = None
-        self._deferred = deferred
+        self._unlocked_calls = unlocked_calls
         self._function = function
 
     def come_due(self) -> None:
         """Let the function be called."""
-        self._deferred.append(self._function)
+        self._unlocked_calls.append(self._function)
 
 
 class Overdue:
@@ -131,7 +133,7 @@ class DueTimes:
 
     def call_at(self, at: int, function: Callable[[], None]) -> None:
         """Call a function at a time, without the lock."""
-        self._agenda.set(Call(self._pool.deferred, function), at, at)
+        self._agenda.set(Call(self._pool.unlocked_calls, function), at, at)
         self.arm_by(at)
 
     def is_due(self, now: int) -> bool:
@@ -227,7 +229,7 @@ class DueTimes:
         """
         watch = self._watch
         at = min(self._agenda.first_latest(), now + patience)
-        if at < watch.at or watch.at < now + GUARD_NS:
+        if at < watch.at or watch.at < now + PATIENCE_NS:
             watch.arm(at)
 
     def has_looked(self, now: int) -> None:

@@ -11,8 +11,8 @@ that times never decrease.  The engine and ``other_processes`` change the core's
 ``registry`` adds and removes groups; nothing else does.
 
 1.  *Ready work* (``timer_due``, ``arrived``, ``ready``) belongs to a job of a declared DAG, or to
-    none.  Messages of known publications go to the job of these (``jobs``), others may enter from
-    another process (``other_processes``), and all others run as undeclared.
+    none.  Messages of known publications go to the job of these (``attribution``), others may
+    enter from another process (``other_processes``), and all others run as undeclared.
 2.  *Queue depth.*  A queue retains as many messages as its QoS allows; beyond that the oldest are
     dropped and counted, and with ``DEMOTE`` late ones of jobs after it: a queue that stays full
     would make every message wait for as many periods.  The place of a dropped message is its
@@ -62,11 +62,17 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
+from mddag_executor.executor.attribution import (
+    Announced,
+    Attribution,
+    header_stamp,
+    NO_ORIGIN,
+    Origin,
+)
 from mddag_executor.executor.bounds import NET_NS, SHORT_CALLBACK_NS
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.interpreter import has_waiting, Interpreter
-from mddag_executor.executor.jobs import Announced, header_stamp, Jobs, NO_ORIGIN, Origin
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
@@ -133,7 +139,7 @@ class Engine:
         self.scheduler = Scheduler(self.tables, n_workers, policy)
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
-        self.jobs = Jobs(task_set)
+        self.attribution = Attribution(task_set)
         #: Judges what is required of paths; None: nothing is.
         self.path_watch = PathWatch(task_set, process) if task_set is not None and any(
             path.requirements for path in task_set.paths) else None
@@ -156,7 +162,7 @@ class Engine:
         self.on_silent: Callable[[Origin, str], None] | None = None
         admit(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
-            task_set, self.tables, self.scheduler, self.jobs, process)
+            task_set, self.tables, self.scheduler, self.attribution, process)
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.n_workers = n_workers
         self.record = record
@@ -199,8 +205,8 @@ class Engine:
         """
         assert self.record is not None
         self.record(
-            'rmw_take', now, get_native_id(), id(entity.rclpy), id(message), source_timestamp,
-            True, number or 0)
+            'rmw_take', now, get_native_id(), id(entity.rclpy_object), id(message),
+            source_timestamp, True, number or 0)
 
     def never_taken(self, entity: Entity, count: int, now: int) -> None:
         """Note that the middleware dropped messages (see ``gaps``), as the next one shows."""
@@ -662,7 +668,7 @@ class Engine:
             return rad_offset[self.tables.n_vertices]
         if entity.source >= 0:
             deadline = rad_offset[entity.source]
-            if entity.is_due_at_release or self.jobs.is_released_at_arrival(
+            if entity.is_due_at_release or self.attribution.is_released_at_arrival(
                     self.tables.dag_of[entity.source]):
                 return deadline
         else:
@@ -871,7 +877,7 @@ class Engine:
         pending = self._state.x_pending[self.scheduler.execution(slot, vertex)]
         if pending > 1:
             return None     # a leg of a sync that was not the last
-        published = self.jobs.published(origin)
+        published = self.attribution.published(origin)
         if work.entity.awaiting is not None:
             published = set(work.published)
         if not failed and pending >= 0:

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 
 from mddag_executor.core import legs_of, Tables
 from mddag_executor.core.driven import Awaiting
+from mddag_executor.executor.attribution import new_address, Origin
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.gil import GilHabit
-from mddag_executor.executor.jobs import new_address, Origin
 from mddag_executor.executor.loop import ChannelSource
 from msg_graph import Callback, TaskSet
 from msg_graph.binding import Entity as Declarable
@@ -34,7 +34,7 @@ class Entity(ChannelSource):
     """
     An entity as the executor sees it.
 
-    :param rclpy: rclpy's own object; None: it has none (a task).
+    :param rclpy_object: the object of rclpy; None: it has none (a task).
     :param node: the full name of its node.
     :cvar kind: what it is called in names, statistics and recordings.
     :cvar is_due_at_release: whether its arrivals are the releases of its jobs (a timer's).
@@ -57,16 +57,16 @@ class Entity(ChannelSource):
     is_known_to_caret: ClassVar[bool] = False
 
     __slots__ = (
-        'declarable', 'rclpy', 'node', 'callback', 'group', 'outer', 'depth', 'label', 'source',
-        'targets', 'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped', 'lost',
-        'skipped', 'busy_ns', 'unattributed', 'guessed', 'removed', 'may_be_gone', 'address',
-        'handle', 'remote_publishers', 'awaits', 'is_own', 'incompatible_qos', 'wall_ns',
-        'tail_ns', 'publishes', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
+        'declarable', 'rclpy_object', 'node', 'callback', 'group', 'outer', 'depth', 'label',
+        'source', 'targets', 'topic', 'waiting', 'last_since', 'ready', 'ran', 'failed', 'dropped',
+        'lost', 'skipped', 'busy_ns', 'unattributed', 'guessed', 'removed', 'may_be_gone',
+        'address', 'handle', 'remote_publishers', 'awaits', 'is_own', 'incompatible_qos',
+        'wall_ns', 'tail_ns', 'publishes', 'habit', 'since', 'gate', 'exclusive', 'most_waiting',
         'collect_more', 'counts_as_eager', 'queue', 'awaiting', 'may_answer', '__weakref__')
 
-    def __init__(self, rclpy: Any, node: str) -> None:
+    def __init__(self, rclpy_object: Any, node: str) -> None:
         super().__init__()
-        self.rclpy = rclpy
+        self.rclpy_object = rclpy_object
         self.node = node
         self.declarable: Declarable | None = None
         self.callback: Callback | None = None
@@ -164,11 +164,11 @@ class Entity(ChannelSource):
     @property
     def symbol(self) -> str:
         """Return module and name of its callback, in the form of ``rclcpp_callback_register``."""
-        function: Any = getattr(self.rclpy, 'callback', None)
+        function: Any = getattr(self.rclpy_object, 'callback', None)
         while isinstance(function, functools.partial):
             function = function.func
         if function is None:
-            function = type(self.rclpy) if self.names_type else None
+            function = type(self.rclpy_object) if self.names_type else None
         elif not hasattr(function, '__qualname__'):
             function = type(function)
         return '' if function is None else f'{function.__module__}.{function.__qualname__}'

@@ -32,13 +32,13 @@ class CallbackGroups:
 
     def enter(self, entity: Entity) -> None:
         """Set the callback group of a new entity."""
-        rclpy_entity = entity.rclpy
-        group = getattr(rclpy_entity, 'callback_group', None)
+        rclpy_object = entity.rclpy_object
+        group = getattr(rclpy_object, 'callback_group', None)
         decides = group is not None and decides_itself(group)
-        entity.group = self._number(rclpy_entity if decides else group)
+        entity.group = self._number(rclpy_object if decides else group)
         if decides:
-            entity.gate = partial(step_in_group, group, rclpy_entity, self._passed)
-        elif group is not None and entity.group >= 0 and group.has_entity(rclpy_entity):
+            entity.gate = partial(step_in_group, group, rclpy_object, self._passed)
+        elif group is not None and entity.group >= 0 and group.has_entity(rclpy_object):
             entity.exclusive = group
 
     def _number(self, group: Any) -> int:

@@ -48,7 +48,7 @@ class Hall(Protocol):
     """
     The worker pool, to a source: see ``workers.WorkerPool``.
 
-    :ivar deferred: functions to call when the calling thread does not own the lock.
+    :ivar unlocked_calls: functions to call when the calling thread does not own the lock.
     :ivar outer_groups: the executors for done callbacks of outer groups, by their numbers.
     """
 
@@ -60,7 +60,7 @@ class Hall(Protocol):
     now: int
     lock: Any
     context: Any
-    deferred: deque[Callable[[], None]]
+    unlocked_calls: deque[Callable[[], None]]
     outer_groups: dict[int, Any]
 
     @property

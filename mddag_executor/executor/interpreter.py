@@ -20,7 +20,7 @@ from mddag_executor.core.queues import (
     overtaking_pays_from,
 )
 from mddag_executor.core.state import N_IDLE, State
-from mddag_executor.executor.bounds import GUARD_NS, GUARD_PART, MOST, SHORT_CALLBACK_NS
+from mddag_executor.executor.bounds import MOST, PATIENCE_NS, PATIENCE_PART, SHORT_CALLBACK_NS
 
 if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
@@ -60,8 +60,8 @@ class Interpreter:
         vertex = self._tables.n_vertices
         if ready:
             vertex = self._state.x_vertex[first_of(self._state, ready[0])]
-        return min(GUARD_NS, max(
-            2 * SHORT_CALLBACK_NS, self._tables.rad_offset[vertex] // GUARD_PART))
+        return min(PATIENCE_NS, max(
+            2 * SHORT_CALLBACK_NS, self._tables.rad_offset[vertex] // PATIENCE_PART))
 
     def may_be_overtaken(self, now: int) -> bool:
         """Return whether the first waiting execution may overtake the latest holder."""

@@ -131,9 +131,9 @@ class ListenerEntity(Kind):
     rooms: Rooms
     loop: EventLoop
 
-    def __init__(self, rclpy: Any, node: str) -> None:
-        super().__init__(rclpy, node)
-        self.handle = rclpy.handle
+    def __init__(self, rclpy_object: Any, node: str) -> None:
+        super().__init__(rclpy_object, node)
+        self.handle = rclpy_object.handle
 
     def listen_in(self, rooms: Rooms, loop: EventLoop, share: str = '') -> None:
         """

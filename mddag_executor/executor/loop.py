@@ -150,12 +150,12 @@ class EventLoop:
         self._shared = {name: each for name, each in self._shared.items() if each != fd}
         self._free.append(fd)
 
-    def hold(self, sources: Iterable[ChannelSource]) -> None:
-        """Stop wake-ups for some sources until ``release``; from any thread, without the lock."""
+    def mute(self, sources: Iterable[ChannelSource]) -> None:
+        """Stop wake-ups for some sources until ``unmute``; from any thread, without the lock."""
         self._set_mask(sources, 0)
 
-    def release(self, sources: Iterable[ChannelSource]) -> None:
-        """End ``hold``; arrivals that were not collected wake a thread."""
+    def unmute(self, sources: Iterable[ChannelSource]) -> None:
+        """End ``mute``; arrivals that were not collected wake a thread."""
         self._set_mask(sources, _EDGE)
 
     def _set_mask(self, sources: Iterable[ChannelSource], mask: int) -> None:

@@ -45,9 +45,9 @@ import threading
 from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
+from mddag_executor.executor.attribution import Attribution, Origin
 from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.jobs import Jobs, Origin
 from mddag_executor.executor.verdicts import Record
 from msg_graph import Dag, TaskSet, Vertex
 
@@ -63,7 +63,8 @@ class OtherProcesses:
     """
 
     def __init__(
-        self, task_set: TaskSet, tables: Tables, scheduler: Scheduler, jobs: Jobs,
+        self, task_set: TaskSet, tables: Tables, scheduler: Scheduler,
+        attribution: Attribution,
         dags: Sequence[Dag], announced: Set[int] = frozenset(),
     ) -> None:
         self._announced = announced
@@ -71,7 +72,7 @@ class OtherProcesses:
         self._dags = [d for d in task_set.dags if d.index in self._crossing | announced]
         self._tables = tables
         self._scheduler = scheduler
-        self._job_notes = jobs
+        self._attribution = attribution
         self._callbacks = [v.callback.key for d in task_set.dags for v in d.vertices]
         self._here: dict[int, list[int]] = {}
         # the topics on which messages go to other processes
@@ -83,8 +84,8 @@ class OtherProcesses:
 
     @staticmethod
     def of(
-        task_set: TaskSet | None, tables: Tables, scheduler: Scheduler, jobs: Jobs,
-        process: str | None,
+        task_set: TaskSet | None, tables: Tables, scheduler: Scheduler,
+        attribution: Attribution, process: str | None,
     ) -> OtherProcesses | None:
         """
         Return the object for a declaration; None: no DAG extends beyond the process.
@@ -97,7 +98,7 @@ class OtherProcesses:
         announced: set[int] = set() if process is None else divided(task_set)
         if not stamped and not announced:
             return None
-        return OtherProcesses(task_set, tables, scheduler, jobs, stamped, announced)
+        return OtherProcesses(task_set, tables, scheduler, attribution, stamped, announced)
 
     @property
     def announces(self) -> bool:
@@ -129,8 +130,8 @@ class OtherProcesses:
         self._leaving = {
             t for dag in self._dags for v in dag.vertices if self._here[dag.index][v.index]
             for t in v.callback.publishes if self._leaves(dag, v, self._here[dag.index], t)}
-        self._job_notes.note_headers(self.note, leaving)
-        self._job_notes.announce_on(announced)
+        self._attribution.note_headers(self.note, leaving)
+        self._attribution.announce_on(announced)
         for entity in entities:
             entity.awaits = any(
                 self._callbacks[v] not in hosted and self._tables.dag_of[v] in self._announced
@@ -141,7 +142,7 @@ class OtherProcesses:
         """Return the topics of leaving or entering jobs without an endpoint of another process."""
         here = Counter(entity.label for entity in entities)
         found = [e.label for e in entities if (e.awaits or e.remote_publishers)
-                 and not e.rclpy.get_publisher_count()]
+                 and not e.rclpy_object.get_publisher_count()]
         for publisher in (p for node in nodes for p in node.publishers):
             topic = publisher.topic_name
             if topic in self._leaving and publisher.get_subscription_count() <= here[topic]:

@@ -9,8 +9,9 @@ Theory of operation
 guard conditions are wrapped once for the process, when the first executor is made.
 
 1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
-2.  *A publication on a trigger topic* is noted, so that its messages find their job (``jobs``).
-    Those outside of callbacks are counted, because the middleware numbers them as well.
+2.  *A publication on a trigger topic* is noted, so that its messages find their job
+    (``attribution``).  Those outside of callbacks are counted, because the middleware numbers them
+    as well.
 3.  *Delivery within the process.*  A middleware that delivers within a process does so inside
     ``publish``: the message can be taken when that returns.  The publishing thread takes the
     message itself instead of waking a worker.  The descriptors of this process's subscriptions on
@@ -33,8 +34,8 @@ from __future__ import annotations
 import threading
 from typing import Any
 
+from mddag_executor.executor.attribution import NO_ORIGIN, Publication, PublisherState
 from mddag_executor.executor.compat import GUARD_HANDLE
-from mddag_executor.executor.jobs import NO_ORIGIN, Publication, PublisherState
 from mddag_executor.executor.listeners import announce_trigger
 from mddag_executor.executor.work import current
 from rclpy.client import Client
@@ -50,29 +51,29 @@ class LocalDelivery:
     :param pool: the ``WorkerPool``.
     """
 
-    __slots__ = ('sources', '_pool', '_is_held')
+    __slots__ = ('sources', '_pool', '_is_muted')
 
     def __init__(self, sources: tuple[Any, ...], pool: Any) -> None:
         self.sources = sources
         self._pool = pool
-        self._is_held = False
+        self._is_muted = False
 
-    def hold(self) -> None:
+    def mute(self) -> None:
         """Pause announcements, if a thread waits for them, or may look for them."""
         if self._pool.has_idle_threads():
             try:
-                self._pool.loop.hold(self.sources)
+                self._pool.loop.mute(self.sources)
             finally:
-                self._is_held = True  # last: a thread that ends it meanwhile may be too early
+                self._is_muted = True  # last: a thread that ends it meanwhile may be too early
 
     def listen_again(self, subscription: Any) -> None:
         """Announce a subscription again after the middleware has replaced its reader."""
         for source in self.sources:
-            if source.rclpy is subscription:
+            if source.rclpy_object is subscription:
                 source.listen_again()
 
     def collect_published(self, publication: Publication | None) -> None:
-        """Collect arrivals announced since ``hold``, and resume announcements."""
+        """Collect arrivals announced since ``mute``, and resume announcements."""
         pool = self._pool
         running = current.running
         if running is None or running.pool is not pool:
@@ -85,9 +86,9 @@ class LocalDelivery:
                     posted |= source.collect_published(publication)
                 if posted:
                     pool.wake_for_more()
-        if self._is_held:
-            self._is_held = False
-            pool.loop.release(self.sources)
+        if self._is_muted:
+            self._is_muted = False
+            pool.loop.unmute(self.sources)
 
 
 _STATE = '_mddag_publisher_state'
@@ -151,7 +152,7 @@ def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Pub
     topic = None
     if running is not None:
         running.publishes(state, msg)
-        topic = running.engine.jobs.topics.get(state.topic)
+        topic = running.engine.attribution.topics.get(state.topic)
     if running is not None and topic is None and not state.is_tracked:
         original(publisher, msg)
         return None
@@ -166,7 +167,7 @@ def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Pub
             if work is not None and work.entity.awaiting is not None:
                 running.engine.note_published(work, state.topic, msg)
             origin = None if work is None else work.origin or work.answers
-            publication: Publication = running.engine.jobs.publish(
+            publication: Publication = running.engine.attribution.publish(
                 original, publisher, msg, state, topic, origin or NO_ORIGIN)
             return publication
         except BaseException:
@@ -198,7 +199,7 @@ def install() -> None:
         publication = None
         try:  # an interrupt at any place must not leave the descriptors switched off
             for delivery in deliveries:
-                delivery.hold()
+                delivery.mute()
             publication = _send(send, self, msg, state)
         finally:
             for delivery in deliveries:

@@ -95,14 +95,14 @@ class Recorder:
         entity.record(self._say, node)
         if not entity.is_known_to_caret:
             return
-        group = getattr(entity.rclpy, 'callback_group', None)
+        group = getattr(entity.rclpy_object, 'callback_group', None)
         if group is not None and group not in self._known:
             self._known.add(group)
             exclusive = entity.group >= 0 and entity.gate is None
             kind = 'mutually_exclusive' if exclusive else 'reentrant'
             self._say('add_callback_group', id(self), id(group), kind)
         if group is not None:
-            self._say(f'callback_group_add_{entity.kind}', id(group), id(entity.rclpy))
+            self._say(f'callback_group_add_{entity.kind}', id(group), id(entity.rclpy_object))
 
     def close(self, now: int, end: int | None = None) -> None:
         """

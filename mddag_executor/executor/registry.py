@@ -146,19 +146,19 @@ class Registry:
             group = self.outer_groups.get(node)
             outer = -1 if group is None else group.number
             for list_name, some in zip(LISTS, lists):
-                for rclpy_entity in some:
-                    entity = self.by_id.get(id(rclpy_entity))
-                    if entity is None or entity.rclpy is not rclpy_entity:
-                        new.append((list_name, rclpy_entity, name, outer))
+                for rclpy_object in some:
+                    entity = self.by_id.get(id(rclpy_object))
+                    if entity is None or entity.rclpy_object is not rclpy_object:
+                        new.append((list_name, rclpy_object, name, outer))
                     else:
-                        present[id(rclpy_entity)] = entity
+                        present[id(rclpy_object)] = entity
                         self._change(entity, outer)
         gone = [each for key, each in self.by_id.items() if key not in present]
         for each in gone:  # first: a new one may be their callback's next entity
             self.bindings.unbind(each)
         appeared = [self._appear(*each, now) for each in new]
         added = [each for each in appeared if each is not None]
-        present.update((id(each.rclpy), each) for each in added)
+        present.update((id(each.rclpy_object), each) for each in added)
         with self._counting:
             self.by_id = present
             self._retired.extend(gone)
@@ -175,18 +175,18 @@ class Registry:
         return Changes(added, gone)
 
     def _appear(
-        self, list_name: str, rclpy_entity: Any, node: str, outer: int, now: int
+        self, list_name: str, rclpy_object: Any, node: str, outer: int, now: int
     ) -> Kind | None:
         kind = next(each for each in KINDS
-                    if each.list_name == list_name and each.fits(rclpy_entity))
+                    if each.list_name == list_name and each.fits(rclpy_object))
         try:
-            entity = kind(rclpy_entity, node)
+            entity = kind(rclpy_object, node)
             entity.describe()
         except InvalidHandle:
             return None  # destroyed after it was listed
         entity.outer = outer
         entity.since = now
-        entity.is_own = rclpy_entity in self.own
+        entity.is_own = rclpy_object in self.own
         self._groups.enter(entity)
         self.bindings.bind(entity)
         return entity
@@ -219,7 +219,7 @@ class Registry:
         if status is None or handler.event_type != incompatible:
             return
         for entity in self.of_kind(SubscriptionEntity):
-            if handler in entity.rclpy.event_handlers:
+            if handler in entity.rclpy_object.event_handlers:
                 entity.incompatible_qos = qos_policy_name_from_kind(status.last_policy_kind)
 
     # --- counts ----------------------------------------------------------------------------------

@@ -23,9 +23,9 @@ from functools import partial
 from typing import Any
 
 from mddag_executor.executor import compat
+from mddag_executor.executor.attribution import Publication, stamped_release
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.gaps import Gaps
-from mddag_executor.executor.jobs import Publication, stamped_release
 from mddag_executor.executor.kinds import ListenerEntity, Rooms
 from mddag_executor.executor.listeners import MANY, set_listener, take_count
 from mddag_executor.executor.work import Work
@@ -71,7 +71,7 @@ class ArrivalEntity(ListenerEntity):
                     return
                 self.post(taken)
         except compat.RCL_ERRORS as error:
-            if not compat.alive(self.rclpy):
+            if not compat.alive(self.rclpy_object):
                 return
             self.rooms.pool.fail(error)
         except Exception as error:
@@ -97,8 +97,8 @@ class SubscriptionEntity(ArrivalEntity):
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
-        self.topic = self.label = self.rclpy.topic_name
-        qos = self.rclpy.qos_profile
+        self.topic = self.label = self.rclpy_object.topic_name
+        qos = self.rclpy_object.qos_profile
         if qos.history == HistoryPolicy.KEEP_LAST:
             self.depth = qos.depth
         else:
@@ -111,7 +111,7 @@ class SubscriptionEntity(ArrivalEntity):
 
     def listen(self, rooms: Rooms) -> None:
         """Let messages be collected, also by publishing threads of this process."""
-        subscription, pool = self.rclpy, rooms.pool
+        subscription, pool = self.rclpy_object, rooms.pool
         if compat.is_of_wait_for_message(subscription):
             return
         self._take = compat.message_taker(subscription)
@@ -136,7 +136,7 @@ class SubscriptionEntity(ArrivalEntity):
 
     def record(self, say: Callable[..., None], node: int) -> None:
         """Record it with CARET's tracepoints."""
-        handle = id(self.rclpy)
+        handle = id(self.rclpy_object)
         say('rcl_subscription_init', handle, node, handle, self.label, self.depth)
         say('rclcpp_subscription_init', handle, handle)
         say('rclcpp_subscription_callback_added', handle, self.address)
@@ -154,7 +154,7 @@ class SubscriptionEntity(ArrivalEntity):
             gaps.expected += 1
         elif missing := gaps.missing(number):
             pool.engine.never_taken(self, missing, pool.now)
-        work = Work(self, self.rclpy.callback, taken if self._with_info else (taken[0],))
+        work = Work(self, self.rclpy_object.callback, taken if self._with_info else (taken[0],))
         if self._is_plain:
             pool.engine.ready(work, pool.now)
         else:
@@ -185,10 +185,10 @@ class SubscriptionEntity(ArrivalEntity):
         origin = None
         release = header = -1
         if self.source >= 0:
-            release, header = engine.jobs.release(
+            release, header = engine.attribution.release_of(
                 engine.tables.dag_of[self.source], message, stamp, now, pool.clock)
         elif self.targets:
-            origin = publication.origin if publication is not None else engine.jobs.find(
+            origin = publication.origin if publication is not None else engine.attribution.find(
                 self.topic, stamp, info.get('publication_sequence_number'))
             if origin is None and self.remote_publishers:
                 release, header = stamped_release(message, pool.clock)
@@ -219,7 +219,7 @@ class SubscriptionEntity(ArrivalEntity):
         if publication is not None:
             info = taken[1]
             sequence = info.get('publication_sequence_number')
-            if not publication.holds(info['source_timestamp']) or (
+            if not publication.covers(info['source_timestamp']) or (
                     sequence is not None and not publication.numbers.agree_at_once(
                         publication.sequence, sequence)):
                 publication = None
@@ -246,7 +246,7 @@ class ClockEntity(SubscriptionEntity):
 
     def listen(self, rooms: Rooms) -> None:
         """Let the spinning thread collect messages."""
-        self._take = compat.message_taker(self.rclpy)
+        self._take = compat.message_taker(self.rclpy_object)
         self.listen_in(rooms, rooms.at_once.loop)
 
     def ignore(self) -> None:
@@ -255,7 +255,7 @@ class ClockEntity(SubscriptionEntity):
 
     def post(self, taken: Any, publication: Publication | None = None) -> None:
         """Set simulated time."""
-        self.rclpy.callback(taken[0])
+        self.rclpy_object.callback(taken[0])
         self.rooms.at_once.count(self)
 
 
@@ -270,7 +270,7 @@ class ServiceEntity(ArrivalEntity):
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
-        self.label = compat.service_name(self.rclpy)
+        self.label = compat.service_name(self.rclpy_object)
         self.most_waiting = SERVICE_DEPTH
         self.declarable = Declarable(self.node, self.kind, self.label)
 
@@ -280,13 +280,13 @@ class ServiceEntity(ArrivalEntity):
 
     def listen(self, rooms: Rooms) -> None:
         """Let requests be collected; the built-in services of a node share a descriptor."""
-        self._take = compat.request_taker(self.rclpy)
+        self._take = compat.request_taker(self.rclpy_object)
         self.listen_in(rooms, rooms.pool.loop,
-                       f'services {self.node}' if compat.is_builtin(self.rclpy) else '')
+                       f'services {self.node}' if compat.is_builtin(self.rclpy_object) else '')
 
     def record(self, say: Callable[..., None], node: int) -> None:
         """Record it with CARET's tracepoints."""
-        handle = id(self.rclpy)
+        handle = id(self.rclpy_object)
         say('rcl_service_init', handle, node, handle, self.label)
         say('rclcpp_service_callback_added', handle, self.address)
         say('rclcpp_callback_register', self.address, self.symbol)
@@ -294,7 +294,7 @@ class ServiceEntity(ArrivalEntity):
     def post(self, taken: Any) -> None:
         """Report a request to the engine."""
         request, header = taken
-        service, pool = self.rclpy, self.rooms.pool
+        service, pool = self.rclpy_object, self.rooms.pool
         engine = pool.engine
         # a recording tells requests apart by the time at which they became ready
         now = pool.now
@@ -320,11 +320,11 @@ class ClientEntity(ArrivalEntity):
 
     def describe(self) -> None:
         """Set its label."""
-        self.label = compat.service_name(self.rclpy)
+        self.label = compat.service_name(self.rclpy_object)
 
     def listen(self, rooms: Rooms) -> None:
         """Let the spinning thread collect responses."""
-        self._take = compat.response_taker(self.rclpy)
+        self._take = compat.response_taker(self.rclpy_object)
         self.listen_in(rooms, rooms.at_once.loop)
 
     def post(self, taken: Any) -> None:
@@ -332,6 +332,6 @@ class ClientEntity(ArrivalEntity):
         header, response = taken
         pool = self.rooms.pool
         compat.complete_request(
-            self.rclpy, header.request_id.sequence_number, response,
+            self.rclpy_object, header.request_id.sequence_number, response,
             pool.outer_groups.get(self.outer) or pool.executor)
         self.rooms.at_once.has_run = True

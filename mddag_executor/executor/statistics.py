@@ -46,8 +46,8 @@ def statistics(
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
         'unattributed': {
-            'unknown': engine.jobs.unknown,
-            'doubtful': engine.jobs.doubtful},
+            'unknown': engine.attribution.unknown,
+            'doubtful': engine.attribution.doubtful},
         'never_ran': never_ran,
         'unreported_misses': 0 if notifier is None else notifier.unreported,
         'trace': None if recorder is None else {

@@ -10,7 +10,7 @@ task was awaited, or got a done callback, before it failed (it is *observed*).  
 for a task (``spin_until_future_complete``) is no observer: it raises the task's exception itself.
 
 With several workers a task may fail before the callback that created it reaches its ``await`` or
-``result()``.  So the exception of such a task is deferred while that callback runs and a reference
+``result()``.  So the exception of such a task is kept while that callback runs and a reference
 to the task exists.  If the exception is fetched meanwhile, it is handled.
 """
 
@@ -47,7 +47,7 @@ class ObservedTask(BareTask):
     A task that knows whether it is observed, so that its exception is handled.
 
     :ivar maker: the execution whose callback has created it, or None.
-    :ivar deferred_to: receives a deferred exception that was not handled.
+    :ivar report_to: receives a kept exception that was not handled.
     :ivar spins: how many spins wait for its end.
     :ivar outer_group: the one that it belongs to, which exists as long as the task.
     """
@@ -58,14 +58,14 @@ class ObservedTask(BareTask):
         self.observed = False
         running = current.running
         self.maker: Work | None = None if running is None else running.work
-        self.deferred_to: Callable[[BaseException], None] | None = None
+        self.report_to: Callable[[BaseException], None] | None = None
         self.spins = 0
         self._claims = [None]
         super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
 
     def __del__(self) -> None:
-        """Report a deferred exception: it cannot be handled any more."""
-        if self.deferred_to is not None:
+        """Report a kept exception: it cannot be handled any more."""
+        if self.report_to is not None:
             self.report()
         super().__del__()  # type: ignore[no-untyped-call]
 
@@ -89,8 +89,8 @@ class ObservedTask(BareTask):
         return self.spins > 0 or self.maker is not None and self.maker.x >= 0
 
     def report(self) -> None:
-        """Report a deferred exception, unless it has been handled."""
-        report, self.deferred_to = self.deferred_to, None
+        """Report a kept exception, unless it has been handled."""
+        report, self.report_to = self.report_to, None
         error = None if report is None else self.claim()
         if error is not None and report is not None:
             report(error)
@@ -129,7 +129,7 @@ class Unclaimed:
                 raise error
             return
         forget_task_frames(error)  # else the task refers to itself
-        task.deferred_to = self._fail
+        task.report_to = self._fail
         self._tasks.append(weakref.ref(task))
         self._ring()
 

@@ -81,26 +81,26 @@ class TimerEntity(ListenerEntity):
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
-        period = self.rclpy.timer_period_ns
+        period = self.rclpy_object.timer_period_ns
         self.depth, self.label = 1, exact_duration(period)
         self.may_be_gone = True
         self.declarable = Declarable(self.node, self.kind, '', period)
 
     def is_cancelled(self) -> bool:
         """Return whether it was cancelled: it may have become due once more before that."""
-        return bool(self.rclpy.is_canceled())
+        return bool(self.rclpy_object.is_canceled())
 
     def record(self, say: Callable[..., None], node: int) -> None:
         """Record it with CARET's tracepoints."""
-        handle = id(self.rclpy)
-        say('rcl_timer_init', handle, self.rclpy.timer_period_ns)
+        handle = id(self.rclpy_object)
+        say('rcl_timer_init', handle, self.rclpy_object.timer_period_ns)
         say('rclcpp_timer_callback_added', handle, self.address)
         say('rclcpp_timer_link_node', handle, node)
         say('rclcpp_callback_register', self.address, self.symbol)
 
     def listen(self, rooms: Rooms) -> None:
         """Let rcl announce resets, and begin to ask when it is due."""
-        timer = self.rclpy
+        timer = self.rclpy_object
         # ``create_rate`` sets the callback only after it has notified the executor
         is_of_rate = self.callback is None and (
             timer.callback is None or ends_sleep(timer.callback))
@@ -160,10 +160,10 @@ class TimerEntity(ListenerEntity):
     def call(self) -> Work | None:
         """Let rcl advance it; return its execution, None if it has no callback."""
         info = self._call()
-        callback = self.rclpy.callback
+        callback = self.rclpy_object.callback
         if callback is None:
             return None
-        return Work(self, with_timer_info(self.rclpy, callback, info))
+        return Work(self, with_timer_info(self.rclpy_object, callback, info))
 
 
 class TimerQueue:
@@ -198,16 +198,16 @@ class TimerQueue:
         """Add a timer."""
         self._timers[id(source)] = source
         if source.may_be_simulated:
-            self._watch(source.rclpy.clock)
+            self._watch(source.rclpy_object.clock)
         self.ask(source)
 
     def remove(self, source: TimerEntity) -> None:
         """Remove a timer."""
         self._timers.pop(id(source), None)
         self._agenda.cancel(source)
-        clock = source.rclpy.clock
+        clock = source.rclpy_object.clock
         if source.may_be_simulated and all(
-                each.rclpy.clock is not clock for each in self._timers.values()):
+                each.rclpy_object.clock is not clock for each in self._timers.values()):
             self._watch_no_more(clock)
 
     def _watch(self, clock: Clock) -> None:

@@ -90,7 +90,7 @@ class Upkeep:
             present = {id(entity) for lists in snapshot(self._nodes()).values()
                        for some in lists for entity in some}
             gone = [each for each in self._registry.by_id.values()
-                    if id(each.rclpy) not in present and each not in self._silent]
+                    if id(each.rclpy_object) not in present and each not in self._silent]
             for entity in gone:
                 self._ignore(entity)
             self._silent += gone

@@ -25,8 +25,8 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.stops import LEAST_NS, Stops
 from mddag_executor.core.tally import VERDICTS
+from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.jobs import Origin
 from msg_graph import TaskSet
 
 KEEP_RESPONSES = 2_000

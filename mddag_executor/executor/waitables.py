@@ -58,8 +58,8 @@ class AskedEntity(Kind):
 
     __slots__ = ('_rooms', '_source')
 
-    def __init__(self, rclpy: Any, node: str) -> None:
-        super().__init__(rclpy, node)
+    def __init__(self, rclpy_object: Any, node: str) -> None:
+        super().__init__(rclpy_object, node)
         self._rooms: Rooms | None = None
         self._source: WaitableSource | None = None
 
@@ -111,8 +111,8 @@ class EventEntity(Kind):
 
     __slots__ = ('_rooms',)
 
-    def __init__(self, rclpy: Any, node: str) -> None:
-        super().__init__(rclpy, node)
+    def __init__(self, rclpy_object: Any, node: str) -> None:
+        super().__init__(rclpy_object, node)
         self._rooms: Rooms | None = None
 
     @classmethod
@@ -144,7 +144,7 @@ def executions_of(entity: Entity, pool: Hall) -> list[Work]:
     An action client forgets the callback of a goal's feedback when the goal's result has come.  So
     each feedback is a separate execution, with its callback.
     """
-    waitable = entity.rclpy
+    waitable = entity.rclpy_object
     data = waitable.take_data()
     compat.attach_futures(waitable, pool.outer_groups.get(entity.outer) or pool.executor)
     found = [Work(entity, callback, (message,))
@@ -166,8 +166,8 @@ class Asked:
         self, entities: Iterable[Entity], pool: Hall, more_guards: Iterable[GuardCondition] = (),
     ) -> None:
         self._pool = pool
-        self.by_id = {id(entity.rclpy): entity for entity in entities}
-        objects = [entity.rclpy for entity in self.by_id.values()]
+        self.by_id = {id(entity.rclpy_object): entity for entity in entities}
+        objects = [entity.rclpy_object for entity in self.by_id.values()]
         self.set = FilledSet(
             pool.context, [each for each in objects if isinstance(each, Waitable)],
             [*more_guards, *(each for each in objects if not isinstance(each, Waitable))])
@@ -238,18 +238,18 @@ class WaitableSource(ChannelSource):
         with self._lock:
             for address in self._guards:  # of destroyed ones as well
                 clear_listener('guard_condition', address, self.fd)
-            call_with_living(
-                [each for each in self._entities if isinstance(each.rclpy, Waitable)], self._clear)
+            call_with_living([each for each in self._entities
+                              if isinstance(each.rclpy_object, Waitable)], self._clear)
         with self._pool.lock:
             self._pool.loop.remove(self)
 
     def _clear(self, living: list[Entity]) -> None:
         self._set.parts(lambda kind, address: clear_listener(kind, address, self.fd),
-                        [each.rclpy for each in living])
+                        [each.rclpy_object for each in living])
 
     def collect(self) -> None:
         """Collect the arrivals soon: without the engine's lock, as this calls foreign code."""
-        self._pool.deferred.append(self._ask)
+        self._pool.unlocked_calls.append(self._ask)
 
     def _ask(self) -> None:
         self._has_more = True
@@ -275,7 +275,7 @@ class WaitableSource(ChannelSource):
             self._pool.call_at(time.monotonic_ns(), self._ask)
         if found:
             self._post_noted(found)
-        with self._set.held():
+        with self._set.protected():
             times = [timer.until() for timer in self._timers]
         for until in times:
             if until is not None and until > 0:  # else its handling is posted, which resets it
@@ -285,7 +285,7 @@ class WaitableSource(ChannelSource):
         """Post executions; a response only after the sending thread has noted the request."""
         early = [] if checks >= SENDER_CHECKS else [
             work for work in found
-            if work.args and compat.sender_is_behind(work.entity.rclpy, work.args[0])]
+            if work.args and compat.sender_is_behind(work.entity.rclpy_object, work.args[0])]
         if len(early) < len(found):
             self._pool.post([work for work in found if work not in early])
         if early:
@@ -302,13 +302,17 @@ def call_with_living(
     :return: the result; None when none is left.
     """
     before = len(entities) + 1
-    while 0 < len(living := [each for each in entities if compat.alive(each.rclpy)]) < before:
+    while 0 < len(living := _living(entities)) < before:
         before = len(living)
         try:
             return call(living)
         except InvalidHandle:
             pass
     return None
+
+
+def _living(entities: list[Entity]) -> list[Entity]:
+    return [each for each in entities if compat.alive(each.rclpy_object)]
 
 
 def open_source(
@@ -540,7 +544,7 @@ class WaitSetThread:
 
     def _build(self, entities: list[Entity]) -> Asked:
         own = [self._guard] + ([self._signals] if self._signals is not None else [])
-        return Asked([each for each in entities if compat.alive(each.rclpy)], self._pool, own)
+        return Asked(_living(entities), self._pool, own)
 
     def _wait(self, waiting: Asked, timeout_ns: int) -> None:
         found, triggered = waiting.ask(timeout_ns)

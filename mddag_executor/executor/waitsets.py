@@ -47,14 +47,14 @@ class FilledSet:
         self.waitables = list(waitables)
         self._guards = {}
         self._context: Any = context.handle
-        self._held = [self._context, *self.waitables]
+        self._protected = [self._context, *self.waitables]
         counts = NumberOfEntities()
         for guard in guards:
             handle: Any = guard.handle
             with handle:
                 self._guards[handle.pointer] = guard
-            self._held.append(handle)
-        with _held(self._held):
+            self._protected.append(handle)
+        with _protected(self._protected):
             for waitable in self.waitables:
                 counts += waitable.get_num_entities()
             self._set = _rclpy.WaitSet(
@@ -62,9 +62,9 @@ class FilledSet:
                 counts.num_timers, counts.num_clients, counts.num_services, counts.num_events,
                 context.handle)
 
-    def held(self) -> AbstractContextManager[None]:
+    def protected(self) -> AbstractContextManager[None]:
         """Protect all of them from being destroyed while entered, or raise InvalidHandle."""
-        return _held(self._held)
+        return _protected(self._protected)
 
     def parts(
         self, call: Callable[[str, int], None], waitables: Iterable[Waitable] | None = None
@@ -78,8 +78,8 @@ class FilledSet:
         :param waitables: only those in these waitables; None: all, with the guard conditions.
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        chosen = self._held if waitables is None else [self._context, *waitables]
-        with _held(chosen):
+        chosen = self._protected if waitables is None else [self._context, *waitables]
+        with _protected(chosen):
             self._fill(self.waitables if waitables is None else waitables,
                        self._guards.values() if waitables is None else ())
             filled = _RclWaitSet.from_address(self._set.pointer)
@@ -111,7 +111,7 @@ class FilledSet:
         :return: the guard conditions that were triggered.
         :raises InvalidHandle: when one of them has been destroyed.
         """
-        with _held(self._held):
+        with _protected(self._protected):
             self._fill(self.waitables, self._guards.values())
             if timeout_ns is not None:
                 self._set.wait(timeout_ns)
@@ -123,7 +123,7 @@ class FilledSet:
 
 
 @contextmanager
-def _held(handles: Iterable[Any]) -> Iterator[None]:
+def _protected(handles: Iterable[Any]) -> Iterator[None]:
     """Protect handles from being destroyed while entered."""
     with ExitStack() as stack:
         for handle in handles:

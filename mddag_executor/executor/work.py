@@ -26,9 +26,9 @@ import threading
 import types
 from typing import Any, Protocol
 
+from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.compat import cancel_running
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.jobs import Origin
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 

@@ -53,6 +53,7 @@ import weakref
 from mddag_executor.clocks import TraceClock
 from mddag_executor.errors import from_user_code
 from mddag_executor.executor.agenda import Agenda
+from mddag_executor.executor.attribution import PublisherState
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
     ALONE_NS,
@@ -70,7 +71,6 @@ from mddag_executor.executor.engine import Engine, Step
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.hall import Announced, Spinner
-from mddag_executor.executor.jobs import PublisherState
 from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.pausing import can_pause, Pause
@@ -244,7 +244,7 @@ class WorkerPool:
         # the last changes of threads: time, name, and new state
         self._history = deque([(0, '', _PARKED)] * HISTORY, HISTORY)
         #: functions to call when the calling thread does not own the lock
-        self.deferred: deque[Callable[[], None]] = deque()
+        self.unlocked_calls: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
         self.parking = Parking()
         self.announcements: Announced | None = None
@@ -344,7 +344,7 @@ class WorkerPool:
     def report(self, event: Callable[..., None], *args: Any) -> None:
         """Report an event to a method of the engine, and wake a thread for ready executions."""
         if self.is_inside():
-            self._defer(partial(self.report, event, *args))
+            self._call_unlocked(partial(self.report, event, *args))
             return
         with self.lock:
             event(*args, self.tick())
@@ -354,9 +354,9 @@ class WorkerPool:
         """Return whether the calling thread owns the lock: in a signal handler or a finalizer."""
         return self.lock._is_owned()  # type: ignore[no-any-return]
 
-    def _defer(self, function: Callable[[], None]) -> None:
+    def _call_unlocked(self, function: Callable[[], None]) -> None:
         """Call a function as soon as the lock is free."""
-        self.deferred.append(function)
+        self.unlocked_calls.append(function)
         self.loop.wake()
 
     def post(self, several: list[Work]) -> None:
@@ -488,7 +488,7 @@ class WorkerPool:
             if not self._closed:
                 for work in self.engine.begun():  # it never goes on
                     if work.entity.exclusive is not None:
-                        work.entity.exclusive.ending_execution(work.entity.rclpy)
+                        work.entity.exclusive.ending_execution(work.entity.rclpy_object)
             self._closed = True
             self.parking.end()
             threads = list(self._threads)
@@ -514,7 +514,7 @@ class WorkerPool:
     def _all_have_ended(self) -> None:
         """Do the rest of ``leave``, once."""
         if self.is_inside():
-            self._defer(self._all_have_ended)
+            self._call_unlocked(self._all_have_ended)
             return
         with self.lock:
             then, self._at_end = self._at_end, _nothing
@@ -649,10 +649,10 @@ class WorkerPool:
             else:
                 self._bell_rings = False  # the waiting thread may have received it
                 self._collect(events, since)
-            is_ready = me.work is None and not self.deferred
+            is_ready = me.work is None and not self.unlocked_calls
             found = is_ready and self._choose(me, self.now)
-        if self.deferred:
-            self._do_deferred()
+        if self.unlocked_calls:
+            self._make_unlocked_calls()
         if not is_ready:
             found = me.work is None and self._go_on(me)
         return found
@@ -713,15 +713,15 @@ class WorkerPool:
             found = not is_last and self._choose(me, self.now)
             if self._pauses:
                 self.end_pauses()
-        if self.deferred:
-            self._do_deferred()
+        if self.unlocked_calls:
+            self._make_unlocked_calls()
         return found
 
     def _note_misses(self) -> None:
         """Let new misses be logged when the lock is free, or when the next line may follow."""
         self._misses = self._verdicts.missed
         if self._miss_log.is_behind():
-            self.deferred.append(self._log_misses)
+            self.unlocked_calls.append(self._log_misses)
         elif not self._logs_later:
             self._logs_later = True
             self.due.call_at(self._miss_log.next_at(), self._log_misses)
@@ -742,11 +742,11 @@ class WorkerPool:
         return min([mine, *(
             each.waits_since for each in self._threads if each.state is ThreadState.WAITING)])
 
-    def _do_deferred(self) -> None:
+    def _make_unlocked_calls(self) -> None:
         """Call the functions that waited for the lock; exceptions do not end the thread."""
-        while self.deferred:
+        while self.unlocked_calls:
             try:
-                function = self.deferred.popleft()
+                function = self.unlocked_calls.popleft()
             except IndexError:
                 break  # another thread has removed it
             try:
@@ -868,7 +868,7 @@ class WorkerPool:
         start = monotonic_ns()
         try:
             if group is not None and work.coroutine is None and (
-                    not group.beginning_execution(entity.rclpy)):
+                    not group.beginning_execution(entity.rclpy_object)):
                 raise Refused
             me.outcome = (
                 work.step(must_check) if gate is None else gate(work, must_check))
@@ -879,7 +879,7 @@ class WorkerPool:
             me.outcome = from_user_code(error)
         if group is not None and (
                 me.outcome is None or isinstance(me.outcome, BaseException)):
-            group.ending_execution(entity.rclpy)
+            group.ending_execution(entity.rclpy_object)
         end = monotonic_ns()
         me.start, me.end = start + self._offset, end + self._offset
         wall = end - start - me.paused_ns
@@ -889,7 +889,7 @@ class WorkerPool:
         else:
             self._note_times(me, work, measurement, wall)
         if self.callback_ended is not None and not isinstance(me.outcome, BaseException):
-            self.callback_ended(entity.rclpy, None, entity.outer)
+            self.callback_ended(entity.rclpy_object, None, entity.outer)
 
     def _note_times(
         self, me: WorkerThread, work: Work, measurement: Measurement | None, wall: int
@@ -927,7 +927,7 @@ class WorkerPool:
             engine.finished(work, start, end, now, me.vtid, worker)
         elif not isinstance(outcome, BaseException):
             engine.suspended(work, start, end, me.vtid, worker)
-            self.deferred.append(partial(self._resume_after, work, outcome))
+            self.unlocked_calls.append(partial(self._resume_after, work, outcome))
         else:
             is_gone = isinstance(outcome, Destroyed)
             if is_over(self.context):  # this may destroy nodes, too
@@ -939,12 +939,12 @@ class WorkerPool:
             if not is_gone and self.callback_ended is None:
                 self.fail(outcome)  # at once: the spin may be about to end
             elif not is_gone:
-                self.deferred.append(partial(self._report_error, work, outcome))
+                self.unlocked_calls.append(partial(self._report_error, work, outcome))
         engine.ask_again()
 
     def _report_error(self, work: Work, error: BaseException) -> None:
         if self.callback_ended is None or not self.callback_ended(
-                work.entity.rclpy, error, work.entity.outer):
+                work.entity.rclpy_object, error, work.entity.outer):
             self.fail(error)
 
     def _resume_after(self, work: Work, awaited: Any) -> None:

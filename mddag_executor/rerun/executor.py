@@ -24,7 +24,7 @@ class NodeHolder(BareExecutor):
         super().__init__(context=context)
         self.task_entity = TaskEntity()
         self._loop = loop
-        self._unclaimed = Unclaimed(lambda error: None)  # none is deferred
+        self._unclaimed = Unclaimed(lambda error: None)  # none is kept
 
     def ordered_nodes(self) -> list[Node]:
         """Return the nodes, by name: their order must not depend on the machine."""

@@ -41,9 +41,9 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DONE, empty
+from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.compat import NEXT_TURN, QuickCallback
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Destroyed, Refused, Work
 from mddag_executor.hosting.loading import describe
 from mddag_executor.rerun.durations import Durations
@@ -329,7 +329,7 @@ class Loop:
             record(execution.thread)  # before its callback's end
         if waits_for is None:
             engine.finished(work, start, now, now, execution.thread, worker)
-            self.on_ended(work.entity.rclpy)
+            self.on_ended(work.entity.rclpy_object)
         else:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resume_when_done(work, waits_for)

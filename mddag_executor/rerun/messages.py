@@ -34,9 +34,9 @@ import re
 from typing import Any
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.executor.attribution import header_stamp, Origin
 from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.jobs import header_stamp, Origin
 from mddag_executor.executor.publishing import state_of
 from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.work import Work
@@ -146,7 +146,8 @@ class Messages:
             outlet.subscriptions = None
             self.offered.setdefault(outlet.state.topic, []).append(outlet)
         for entity in added:
-            if isinstance(entity, SubscriptionEntity) and _is_latched(entity.rclpy.qos_profile):
+            if isinstance(entity, SubscriptionEntity) and _is_latched(
+                    entity.rclpy_object.qos_profile):
                 self._deliver_kept(entity)
         if not self._gives_clock and CLOCK in self._subscriptions and (
                 CLOCK not in self._recording.topics and CLOCK not in self.offered):
@@ -159,7 +160,7 @@ class Messages:
         """Give a subscription what was published before it was there, as far as that is kept."""
         topic = entity.label
         for outlet in self.offered.get(topic, ()):
-            if outlet.kept and outlet.fits(entity.rclpy):
+            if outlet.kept and outlet.fits(entity.rclpy_object):
                 for stamp, data in outlet.kept:
                     self._arrive(entity, data, stamp, None)
         if topic in self._last and topic not in self.offered:
@@ -232,7 +233,7 @@ class Messages:
         if outlet.subscriptions is None:
             outlet.subscriptions = [
                 entity for entity in self._subscriptions.get(state.topic, ())
-                if outlet.fits(entity.rclpy)]
+                if outlet.fits(entity.rclpy_object)]
         for entity in outlet.subscriptions:
             arrive = partial(self._arrive, entity, data, now, origin, state.count)
             target = None if origin is None else entity.targets.get(origin.vertex)
@@ -255,7 +256,8 @@ class Messages:
         recording = self._recording
         new = recording.load({*self._subscriptions, *self.offered})
         for topic, entities in self._subscriptions.items():
-            recorded, wanted = recording.kinds.get(topic), type_name(entities[0].rclpy.msg_type)
+            recorded = recording.kinds.get(topic)
+            wanted = type_name(entities[0].rclpy_object.msg_type)
             if recorded not in (None, wanted) and topic not in self.offered:
                 raise RerunError(
                     f'{recording.name}: {topic} was recorded as {recorded}, and the node '
@@ -298,18 +300,18 @@ class Messages:
             return
         message = self._message(entity, data)
         if entity.at_once:
-            entity.rclpy.callback(message)
+            entity.rclpy_object.callback(message)
             engine.ran_at_once(entity)
             return
         args: tuple[Any, ...] = (message,)
-        if callback_type(entity.rclpy) is WITH_INFO:
+        if callback_type(entity.rclpy_object) is WITH_INFO:
             args = message, {
                 'source_timestamp': source_stamp, 'received_timestamp': now,
                 'publication_sequence_number': number,
                 'reception_sequence_number': entity.ready + 1}
         release = stamp = -1
         if entity.source >= 0:
-            release, _ = engine.jobs.release(
+            release, _ = engine.attribution.release_of(
                 engine.tables.dag_of[entity.source], message, source_stamp, now, self._clock)
             stamp = header_stamp(message)
         elif origin is None and entity.remote_publishers:
@@ -318,11 +320,12 @@ class Messages:
                 stamp = now  # a job of its own
         if engine.record is not None:
             engine.taken(entity, message, source_stamp, number, now)
-        engine.arrived(Work(entity, entity.rclpy.callback, args), origin, release, stamp, now)
+        work = Work(entity, entity.rclpy_object.callback, args)
+        engine.arrived(work, origin, release, stamp, now)
 
     def _message(self, entity: Entity, data: bytes) -> Any:
-        kind = entity.rclpy.msg_type
-        if entity.rclpy.raw:
+        kind = entity.rclpy_object.msg_type
+        if entity.rclpy_object.raw:
             return data
         try:
             return deserialize_message(data, kind)

@@ -132,7 +132,7 @@ class Requests:
         if entity is None:
             self._loop.warn(f'{name}: it is called, and no node of the run offers this service')
             return
-        service = entity.rclpy
+        service = entity.rclpy_object
         work = Work(
             entity, service.callback, (request, service.srv_type.Response()),
             partial(service.send_response, header=(client, number)))

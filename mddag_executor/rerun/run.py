@@ -151,7 +151,7 @@ class Rerun:
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
             record=None if writer is None else writer.record)
         engine.other_processes = OtherProcesses(
-            task_set, engine.tables, engine.scheduler, engine.jobs, task_set.dags)
+            task_set, engine.tables, engine.scheduler, engine.attribution, task_set.dags)
         # the callbacks that hold the interpreter, declared or else recorded
         self._holders = {
             vertex.callback.key for place, vertex in enumerate(task_set.vertices)
@@ -208,12 +208,13 @@ class Rerun:
         added, _ = registry.refresh(snapshot(nodes), now)
         self._hosted |= registry.hosted()
         for entity in added:
-            if entity.rclpy in self._triggered:
-                self._triggered.remove(entity.rclpy)
-                engine.ready(Work(entity, entity.rclpy.callback), now)
+            if entity.rclpy_object in self._triggered:
+                self._triggered.remove(entity.rclpy_object)
+                engine.ready(Work(entity, entity.rclpy_object.callback), now)
             if entity.callback is not None and entity.callback.key in self._holders:
                 entity.habit.holds = 1
-            if isinstance(entity, WaitableEntity) and not self._requests.knows(entity.rclpy):
+            if isinstance(entity, WaitableEntity) and not self._requests.knows(
+                    entity.rclpy_object):
                 self._loop.warn(
                     f'{entity.name}: a waitable of its own kind, which never gets ready')
         self._timers.refresh(registry.of_kind(TimerEntity))

@@ -62,15 +62,15 @@ class Timers:
         """Update which timers there are."""
         before, self._known = self._known, {}
         for entity in entities:
-            known = before.get(entity.rclpy)
+            known = before.get(entity.rclpy_object)
             if known is None:
                 known = _TimerState(entity, self._loop.now)
                 self._schedule(known, self._first_due(entity))
             known.entity = entity
-            self._known[entity.rclpy] = known
+            self._known[entity.rclpy_object] = known
 
     def _first_due(self, entity: Entity) -> int:
-        now, period = self._loop.now, _period(entity.rclpy)
+        now, period = self._loop.now, _period(entity.rclpy_object)
         first = None
         if entity.source >= 0:
             first = self._first_release(self._loop.engine.tables.dag_of[entity.source])
@@ -82,13 +82,13 @@ class Timers:
         """Have a timer fire at a time, unless it is cancelled or destroyed."""
         known.due = -1
         with suppress(InvalidHandle):
-            if not known.entity.rclpy.is_canceled():
+            if not known.entity.rclpy_object.is_canceled():
                 known.due = due
         if 0 <= known.due < self._loop.end:
             self._loop.at(self._loop.after_pause(due), TIMER, self._fire, known, due)
 
     def _fire(self, known: _TimerState, due: int) -> None:
-        timer, engine, now = known.entity.rclpy, self._loop.engine, self._loop.now
+        timer, engine, now = known.entity.rclpy_object, self._loop.engine, self._loop.now
         if known.due != due or self._known.get(timer) is not known or not alive(timer):
             return  # it was reset meanwhile, or is gone
         period = _period(timer)

@@ -42,7 +42,7 @@ from typing import Any, NamedTuple
 
 from mddag_executor.child import Tick
 from mddag_executor.core import legs_of
-from mddag_executor.executor.jobs import header_stamp
+from mddag_executor.executor.attribution import header_stamp
 from mddag_executor.executor.listeners import NextCall
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.session import Session

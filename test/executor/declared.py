@@ -8,7 +8,7 @@ from itertools import count
 from typing import Any, NamedTuple
 
 from mddag_executor.executor import current_job
-from mddag_executor.executor.jobs import header_stamp
+from mddag_executor.executor.attribution import header_stamp
 from msg_graph import loads
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from std_msgs.msg import Header

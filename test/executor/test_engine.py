@@ -10,11 +10,11 @@ from mddag_executor.core import NEVER, POLICIES
 from mddag_executor.core.jobs import source_depth
 from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
+from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import GilCheck, GilHabit
-from mddag_executor.executor.jobs import Origin
 from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest

@@ -8,10 +8,10 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 from mddag_executor.executor.announcements import _ENTRY
-from mddag_executor.executor.jobs import (
+from mddag_executor.executor.attribution import (
     Announced,
+    Attribution,
     header_stamp,
-    Jobs,
     Origin,
     Publication,
     PublisherNumbers,
@@ -271,8 +271,8 @@ def test_a_flood_of_announcements_gets_a_small_part_of_the_time(make_executor, m
     for _ in range(2000):
         announcements._hear(message)
     assert 0 < len(heard) < 2000 * 256 // 2
-    assert 'announcements of jobs are ignored' in executor._pool.deferred.popleft().args[0]
-    assert not executor._pool.deferred
+    assert 'announcements of jobs are ignored' in executor._pool.unlocked_calls.popleft().args[0]
+    assert not executor._pool.unlocked_calls
     before = len(heard)
     assert wait_for(lambda: announcements._hear(message) or len(heard) > before)
 
@@ -287,11 +287,11 @@ ONE_TOPIC = graph(
 
 
 class Bench:
-    """Jobs 1, 2, … whose publications are given: begin, end, and one of two publishers."""
+    """Attribution 1, 2, … whose publications are given: begin, end, and one of two publishers."""
 
     def __init__(self, *publications):
-        self.jobs = Jobs(loads(ONE_TOPIC))
-        self.topic = self.jobs.topics[TOPIC]
+        self.attribution = Attribution(loads(ONE_TOPIC))
+        self.topic = self.attribution.topics[TOPIC]
         self.publishers = [PublisherState(TOPIC), PublisherState(TOPIC)]
         for job, publication in enumerate(publications, 1):
             self.published(job, *publication)
@@ -304,14 +304,14 @@ class Bench:
         publication.end = end
 
     def job(self, stamp, sequence=None):
-        origin = self.jobs.find(TOPIC, stamp, sequence)
+        origin = self.attribution.find(TOPIC, stamp, sequence)
         return None if origin is None else origin.job
 
 
 def test_the_sequence_number_decides_between_publishers():
     bench = Bench((0, 10), (1000, 1010, 1), (2000, 2010, 1), (3000, 3100), (3050, 3150, 1))
     assert [bench.job(3080, number) for number in (None, 2, 3, 9)] == [None, 4, 5, None]
-    assert bench.jobs.doubtful == 2
+    assert bench.attribution.doubtful == 2
 
 
 def test_publications_before_the_count_began_are_learnt():
@@ -334,7 +334,7 @@ def test_messages_of_a_stranger_in_the_window_belong_to_no_job():
             assert bench.job(job * 1000 + 5, number) is None
         assert bench.job(job * 1000 + 6, job) == job
         assert bench.job(job * 1000 + 7, job + 7) is None, 'two within two publications'
-    assert bench.jobs.unknown == 297
+    assert bench.attribution.unknown == 297
 
 
 @given(st.lists(st.tuples(st.integers(1, 50), st.integers(0, 40)), min_size=1, max_size=60),
@@ -355,12 +355,12 @@ def test_it_never_guesses(steps, data):
 
 
 def announced(bench, begin, end, number, sequence, publisher):
-    bench.jobs.note_announced(TOPIC, Publication(
+    bench.attribution.note_announced(TOPIC, Publication(
         begin, publisher, Announced((1, number), 0, 0, 0), sequence, end))
 
 
 def number(bench, stamp, sequence=None):
-    found = bench.jobs.find(TOPIC, stamp, sequence, counted=False)
+    found = bench.attribution.find(TOPIC, stamp, sequence, counted=False)
     return found.name[1] if isinstance(found, Announced) else None
 
 
@@ -369,22 +369,22 @@ def test_a_publication_here_and_one_elsewhere_at_once_are_a_doubt_if_their_numbe
     announced(bench, 5, 15, 1, 9, other)
     assert bench.job(7, 1) == 1 and number(bench, 7, 9) == 1
     announced(bench, 5, 15, 1, 1, PublisherNumbers())
-    assert bench.jobs.find(TOPIC, 7, 1) is None and bench.jobs.doubtful == 1
+    assert bench.attribution.find(TOPIC, 7, 1) is None and bench.attribution.doubtful == 1
 
 
 def test_publications_that_overlap_are_announced_together_when_all_have_returned():
     bench = Bench()
     announced_to = []
-    bench.jobs.announce = lambda send, topic, several: announced_to.append(
+    bench.attribution.announce = lambda send, topic, several: announced_to.append(
         [each.origin.job for each in several])
-    bench.jobs.announce_on({TOPIC})
+    bench.attribution.announce_on({TOPIC})
 
     def publish(job, publisher, send=lambda: None):
-        bench.jobs.publish(lambda *_: send(), None, None, bench.publishers[publisher],
+        bench.attribution.publish(lambda *_: send(), None, None, bench.publishers[publisher],
                            bench.topic, Origin(0, 0, job, publisher))
 
     publish(1, 0)
     publish(2, 0, lambda: publish(3, 1))
-    bench.jobs.announce_on(set())
+    bench.attribution.announce_on(set())
     publish(4, 0)
     assert announced_to == [[1], [3, 2]]

@@ -238,7 +238,7 @@ def test_a_timer_without_a_period_stops_no_other_timer(make_executor, make_node,
         before = len(ran), len(often)
         assert wait_for(lambda: len(ran) >= before[0] + 5 and len(often) > before[1] + 5)
         entity = next(
-            each for each in executor._registry.of_kind(TimerEntity) if each.rclpy is timer)
+            each for each in executor._registry.of_kind(TimerEntity) if each.rclpy_object is timer)
         assert wait_for(lambda: (entity.ready, entity.skipped) == (11, 0))
         go_on.set()
         assert wait_for(lambda: len(always) >= 20)

@@ -118,7 +118,7 @@ may not check
         'test_a_coroutine_that_awaits_something_unknown_is_asked_again[installed-True]'),
         every=True),
     Case('groups_ignored', [(
-        'executor/groups.py', 'self._number(rclpy_entity if decides else group)', '-1'), (
+        'executor/groups.py', 'self._number(rclpy_object if decides else group)', '-1'), (
         'executor/groups.py', 'entity.exclusive = group', 'pass')], of(
         'test_executor.py', 'test_mutually_exclusive_group_is_kept')),
     Case('rad_is_fifo', [(
@@ -226,7 +226,7 @@ vertex, leg = target
         'test_deadlines.py',
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('messages_go_to_the_job_before', [(
-        'executor/jobs.py', 'publication = Publication(time_ns(), ', """\
+        'executor/attribution.py', 'publication = Publication(time_ns(), ', """\
 before = globals().setdefault('BEFORE', {})
         origin, before[state.topic] = before.get(state.topic, origin), origin
         publication = Publication(time_ns(), """)], of(

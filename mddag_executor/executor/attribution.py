@@ -184,7 +184,7 @@ class Publication:
         self.sequence = sequence
         self.origin = origin
 
-    def holds(self, stamp: int) -> bool:
+    def covers(self, stamp: int) -> bool:
         """Return whether a message with this source timestamp may belong to the publication."""
         return self.begin - ROUNDING_NS <= stamp <= self.end + ROUNDING_NS
 
@@ -213,7 +213,7 @@ class Topic:
         self.on_header: Callable[[int, Origin], None] | None = None
 
 
-class Jobs:
+class Attribution:
     """
     Notes publications, and finds the job that a message belongs to.
 
@@ -335,7 +335,7 @@ class Jobs:
         """Return whether jobs of a DAG are released when the message of the source arrives."""
         return self._release_from[dag] == 'arrival'
 
-    def release(
+    def release_of(
         self, dag: int, message: Any, source_timestamp: int, now: int, clock: TraceClock
     ) -> tuple[int, int]:
         """
