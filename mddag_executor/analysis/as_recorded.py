@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.analysis.chains import Chains
 from mddag_executor.analysis.communications import communications, recorded_callbacks
@@ -16,8 +16,9 @@ from mddag_executor.analysis.paths import Paths
 from mddag_executor.analysis.requirements import Requirements
 from mddag_executor.analysis.usage import group_waits, share, Usage
 from mddag_executor.core import NEVER
+from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import ReplayError
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.tables import Recording, TABLES
 from mddag_executor.results.replays import (
     RecordedFile,
     ReplayedDag,
@@ -29,6 +30,9 @@ from mddag_executor.sources.open import Given, open_recording, Progress
 from mddag_executor.text import counted
 from msg_graph import Dag, TaskSet
 from msg_graph.drift import Drift
+
+if TYPE_CHECKING:
+    from mddag_executor.analysis.result_table import ResultTable
 
 
 class Replay:
@@ -89,6 +93,27 @@ class Replay:
     def _waited(self) -> Any:
         return group_waits(self.recording)
 
+    def table(self, name: str) -> Table:
+        """
+        Return a table of results, or a table of the recording.
+
+        :param name: its name on the page about tables, for instance ``verdicts``.
+        :raises KeyError: if there is no such table.
+        """
+        found = _result_table(name)
+        table: Table = getattr(self.recording, name) if found is None else found.table(self)
+        return table
+
+    def to_arrow(self, name: str) -> Any:
+        """Return a table as an Arrow table, with names instead of numbers; see ``table``."""
+        found = _result_table(name)
+        return self.recording.to_arrow(name) if found is None else found.to_arrow(self)
+
+    def to_pandas(self, name: str) -> Any:
+        """Return a table as a pandas data frame, with names instead of numbers; see ``table``."""
+        from mddag_executor.recording.frames import frame_of
+        return frame_of(self.to_arrow(name))
+
     def drift(self) -> list[Drift]:
         """Return the differences between the run and the declaration."""
         return drift_of(self.recording, self.judged.skip)
@@ -147,6 +172,16 @@ class Replay:
         if self.recording.unjudged is not None:
             found['unjudged'] = self.recording.unjudged.get(dag.index, 0)
         return found
+
+
+def _result_table(name: str) -> ResultTable | None:
+    """Return the table of results with this name; None: it is a table of the recording."""
+    from mddag_executor.analysis.result_table import result_tables
+    tables = result_tables()
+    if name not in tables and name not in TABLES:
+        raise KeyError(
+            f'there is no table {name!r}: the tables are {", ".join([*tables, *TABLES])}')
+    return tables.get(name)
 
 
 def slack(sink: SinkCounts) -> SlackTimes | None:

@@ -57,6 +57,14 @@ completed). Times of the execution: ready, first start, last end, total time of 
 for the callback group, CPU time (-1: unknown), ns; ``row`` of the execution.
 """
 
+PARTS = ('release_lag', 'waiting', 'executing', 'suspended', 'transport', 'unknown',
+         'waiting_group')
+"""The parts of a response time; the last one is a part of ``waiting``."""
+RESPONSE_PARTS = np.dtype([
+    ('dag', 'i2'), ('sink', 'i4'), ('job', 'i8'), ('release', 'i8'), ('completed', 'i8'),
+    *((name, 'i8') for name in PARTS)])
+"""Columns of the parts of the response time of a completed sink, ns."""
+
 _USED = ['completes', 'leg', 'ready', 'began', 'end', 'busy', 'cpu']
 """The columns of executions that links have."""
 
@@ -123,6 +131,8 @@ class Chains:
             self._is_other[jobs.done] = False
         self._dags: dict[int, tuple[Any, Any]] = {}
         self._breakdown: dict[int, Breakdown] = {}
+        #: Where the response times went, while they are collected.
+        self._parts: list[Table] | None = None
 
     # --- links -----------------------------------------------------------------------------------
 
@@ -193,7 +203,7 @@ class Chains:
                 good, chain = chain.after(published, ready)
                 before[v] = np.where(good, np.array(legs)[leg], -1)
             if v in task.sinks:
-                self._add_breakdown(dag, v, chain)
+                self._completed(dag, v, chain)
             chains[v] = chain
         return row, before
 
@@ -253,37 +263,81 @@ class Chains:
             self._of_dag(dag)
         return self._breakdown
 
-    def _add_breakdown(self, dag: int, v: int, chain: _Chain) -> None:
-        """Break down the response times of a sink."""
+    def response_parts(self) -> Table:
+        """Return where the response time of each completed sink went: ``RESPONSE_PARTS``."""
+        self._dags.clear()      # the parts are not kept, as most analyses only need their sums
+        self._parts = [rows(RESPONSE_PARTS)]
+        self.breakdown()
+        found, self._parts = self._parts, None
+        return concatenate(found)
+
+    def _completed(self, dag: int, v: int, chain: _Chain) -> None:
+        """Note where the response times of a sink went."""
         sink = self._first[dag] + v
         done = self._judged.of_sink(sink)
         done = done[done['kind'] <= max(SINK_COMPLETED)]
         if not len(done):
             return
-        job, completed, n = done['row'], done['completed'], len(done)
-        took = completed - done['release']
-        columns: Any = [each[..., job] for each in chain]
-        chain = _Chain(*columns)
-        waiting, executing, suspended, group = np.where(chain.known, chain.until(completed), 0)
-        first = np.where(chain.known, chain.first, completed)
-        lag = np.where(chain.known & chain.is_whole, first - done['release'], 0)
-        parts = {
-            'release_lag_ns': lag, 'waiting_ns': waiting, 'executing_ns': executing,
-            'suspended_ns': suspended,
-            'transport_ns': completed - first - waiting - executing - suspended,
-            'unknown_ns': first - done['release'] - lag, 'waiting_group_ns': group}
-        worst = int(took.argmax())
+        known, parts = _parts(done, chain)
+        if self._parts is not None:
+            self._parts.append(parts)
+        self._breakdown[sink] = self._broken_down(dag, v, done['row'], known, parts)
+
+    def _broken_down(
+        self, dag: int, v: int, job: Ints, known: Mask, parts: Table
+    ) -> Breakdown:
+        """Return the means of the parts of the response times of a sink, and the worst job."""
+        worst = int((parts['completed'] - parts['release']).argmax())
         links = self._follow(
-            dag, np.flatnonzero(chain.known[worst:worst + 1]), np.array([v]),
-            job[worst:worst + 1])
-        self._breakdown[sink] = {
+            dag, np.flatnonzero(known[worst:worst + 1]), np.array([v]), job[worst:worst + 1])
+        return {
             'mean': cast(ResponseParts, {
-                name: round(int(part.sum()) / n) for name, part in parts.items()}),
+                f'{name}_ns': round(int(parts[name].sum()) / len(parts)) for name in PARTS}),
             'worst': cast(WorstJob, {
-                'job': int(done['job'][worst]), 'release_ns': int(done['release'][worst]),
-                'completed_ns': int(completed[worst]),
-                **{name: int(part[worst]) for name, part in parts.items()},
+                'job': int(parts['job'][worst]), 'release_ns': int(parts['release'][worst]),
+                'completed_ns': int(parts['completed'][worst]),
+                **{f'{name}_ns': int(parts[name][worst]) for name in PARTS},
                 'chain': [_step_result(self._judged.task_set, each[0]) for each in links][::-1]})}
+
+    def links(self) -> Table:
+        """
+        Return the links of the chains of all verdicts, as far as the jobs got: ``LINKS``.
+
+        ``of`` is the row of the verdict; the links of a chain come in their order.
+        """
+        verdicts, found = self._judged.verdicts, [rows(LINKS)]
+        done = verdicts['kind'] <= max(SINK_COMPLETED)
+        for dag in range(len(self._legs)):
+            mine = verdicts['dag'] == dag
+            which = np.flatnonzero(mine & done)
+            sink, job = verdicts['sink'][which] - self._first[dag], verdicts['row'][which]
+            known = self._of_dag(dag)[0][sink, job] >= 0
+            found += self._follow(dag, which[known], sink[known], job[known])
+            which = np.flatnonzero(mine & ~done)
+            _, links = self.of_misses(dag, verdicts[which])
+            links['of'] = which[links['of']]
+            found.append(links)
+        every = concatenate(found)[::-1]    # each chain was followed from its end
+        return every[np.argsort(every['of'], kind='stable')]
+
+
+def _parts(done: Table, chain: _Chain) -> tuple[Mask, Table]:
+    """
+    Return by completed result whether its chain is known, and where its response time went.
+
+    :param done: verdicts about one sink; ``chain``: the chains of all jobs up to it.
+    """
+    columns: Any = [each[..., done['row']] for each in chain]
+    chain, completed, release = _Chain(*columns), done['completed'], done['release']
+    waiting, executing, suspended, group = np.where(chain.known, chain.until(completed), 0)
+    first = np.where(chain.known, chain.first, completed)
+    lag = np.where(chain.known & chain.is_whole, first - release, 0)
+    return chain.known, rows(
+        RESPONSE_PARTS, len(done), dag=done['dag'], sink=done['sink'], job=done['job'],
+        release=release, completed=completed, release_lag=lag, waiting=waiting,
+        executing=executing, suspended=suspended,
+        transport=completed - first - waiting - executing - suspended,
+        unknown=first - release - lag, waiting_group=group)
 
 
 def _published(several: Sequence[_Chain], leg: Ints, ready: Ints) -> tuple[Ints, _Chain]:

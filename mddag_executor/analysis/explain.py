@@ -416,6 +416,11 @@ class Explanation:
         return sorted({one.callback.topics[place] for leg, (place, _) in enumerate(legs)
                        if leg not in got and one.callback.topics})
 
+    def behind(self) -> dict[int, list[tuple[str, int]]]:
+        """Return by part of a miss the callbacks that ran while it waited, and how long, ns."""
+        return {part: [(self._names[callback], took) for callback, took in waits]
+                for part, waits in sorted(self._waited.items())}
+
     def causes(self) -> dict[tuple[int, int], str]:
         """Return the cause of each miss, by global vertex of the sink and job."""
         missed = self.found.misses

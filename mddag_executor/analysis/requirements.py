@@ -46,6 +46,11 @@ class Requirements:
         self._recording, self._paths = recording, paths
         self._until = recording.judged_until
 
+    @property
+    def paths(self) -> list[Path]:
+        """Return the declared paths."""
+        return self._paths.paths
+
     @cached_property
     def results(self) -> dict[tuple[int, str], Table]:
         """Return by number of a path and what is required a table of ``RESULTS``."""

@@ -21,6 +21,7 @@ from typing import Any, cast
 
 from mddag_executor.analysis.spans import Spans
 from mddag_executor.recording.columns import in_parts, Table
+from mddag_executor.recording.columns import rows as table_of
 from mddag_executor.recording.tables import (
     different,
     Ints,
@@ -34,10 +35,11 @@ from mddag_executor.recording.tables import (
 from mddag_executor.results.replays import CallbackUse, OverTime, WorkerUse
 import numpy as np
 
-NAMES = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
-         'waiting_group_ns', 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter')
+_ALWAYS = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
+           'waiting_group_ns')
+_MEASURED = 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter'
+USAGE = np.dtype([(name, 'i8') for name in (*_ALWAYS, *_MEASURED)])
 """The columns of a callback; the last four are of executions with known CPU time."""
-_MEASURED = NAMES.index('measured')
 # Columns of executions that are summed: of all pieces, and of completed executions.
 _TIMES = ['vertex', 'piece', 'ready', 'start', 'end']
 _TOTALS = ['vertex', 'busy', 'cpu', 'holds_gil']
@@ -180,7 +182,8 @@ class Usage:
         self._places = task_set.callback_indices()
         # by global vertex the index of its callback; the last entry is for undeclared ones
         self._place = np.array([*task_set.places_of_vertices(), len(self._places)])
-        self._table = np.zeros((len(NAMES), len(self._places) + 1), dtype=np.int64)
+        #: By callback its usage, a table of ``USAGE``; the last row is for undeclared ones.
+        self.table = table_of(USAGE, len(self._places) + 1)
         self._duration = end - begin
         table = recording.executions
         for part, wait in zip(in_parts(table), in_parts(waited)):
@@ -225,7 +228,7 @@ class Usage:
 
     def _add(self, name: str, places: Ints, values: Any = None) -> None:
         """Add values to callbacks by index; without values count them."""
-        column = self._table[NAMES.index(name)]
+        column = self.table[name]
         if values is None:
             column += np.bincount(places, minlength=len(column))
         else:
@@ -233,7 +236,7 @@ class Usage:
 
     def _most(self, name: str, places: Ints, times: Ints) -> None:
         """Update the longest times of callbacks by index."""
-        np.maximum.at(self._table[NAMES.index(name)], places, times)
+        np.maximum.at(self.table[name], places, times)
 
     def callbacks(self) -> dict[str, CallbackUse]:
         """Return the usage of each declared callback, in file order."""
@@ -244,9 +247,8 @@ class Usage:
         return self._result(-1)
 
     def _result(self, place: int) -> CallbackUse:
-        column = self._table[:, place].tolist()
-        return cast(CallbackUse, dict(zip(
-            NAMES, column if column[_MEASURED] else column[:_MEASURED])))
+        names = (*_ALWAYS, *_MEASURED) if self.table['measured'][place] else _ALWAYS
+        return cast(CallbackUse, {name: int(self.table[name][place]) for name in names})
 
     def workers(self, count: int) -> WorkerUse:
         """Return how busy the workers were; ``lent`` is the time of blocking calls."""

@@ -5,7 +5,7 @@ The verb `export`: a recording as a file for other tools.
 
 The end of the file's name says which: `.pftrace` for Perfetto's viewer, `.csv` for spreadsheets,
 `.parquet` for data frames.  A name that ends in `/` is a folder for the tables of the
-recording (`mddag_executor.recording.tables`), one Parquet file for each.  The run is judged as
+recording and of its results, one Parquet file for each.  The run is judged as
 `replay` does it.
 """
 
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('-o', '--output', metavar='OUT', type=options.Export, required=True,
         help="the file to write: OUT.pftrace for Perfetto (ui.perfetto.dev), OUT.csv ('-': CSV to "
         'standard output), OUT.parquet, or OUT/, a folder with a Parquet file for each table of '
-        'the recording (Parquet needs mddag_executor[export])')
+        'the recording and its results (Parquet needs mddag_executor[export])')
     add('--rows', choices=('executions', 'jobs'),
         help='for CSV and Parquet: one row for each execution of a callback (default), or for '
         'each job at each sink')
@@ -43,13 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from mddag_executor.recording.frames import FILES, write_tables
-    from mddag_executor.report.export import check_available, write
+    from mddag_executor.report.export import check_available, table_files, write, write_tables
     common.recording_and_graph(args)
     form = _form(args)
     check_available(form)
     if form == _TABLES:
-        common.check_folder(args.output, FILES)
+        common.check_folder(args.output, table_files())
     else:
         common.check_output(args.output)
     source = recorded.source_of(args)
@@ -57,8 +56,8 @@ def main(args: argparse.Namespace) -> int:
         source.check_deadlines()
     replay = recorded.as_recorded(source, 'exporting', begin=args.begin, end=args.end)
     if form == _TABLES:
-        with common.output_folder(args.output, FILES) as folder:
-            write_tables(replay.recording, folder)
+        with common.output_folder(args.output, table_files()) as folder:
+            write_tables(replay, folder)
     else:
         with common.output_file(args.output) as file:
             write(form, file, replay, args.rows or 'executions')

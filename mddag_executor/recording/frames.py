@@ -10,16 +10,13 @@ version of the tables (``mddag.tables``), which changes when the meaning of a co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mddag_executor.recording.tables import REASONS, Recording, TABLES, UNKNOWN
 import numpy as np
 
 VERSION = '1'
-FILES = frozenset(f'{name}.parquet' for name in TABLES)
-"""The files that ``write_tables`` writes."""
 _TIMES = {'release', 'noticed', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'time',
           'source_timestamp', 'deadline', 'completed'}
 _COMPLETES = 'nothing', 'leg', 'vertex'
@@ -32,21 +29,26 @@ def arrow_table(recording: Recording, name: str) -> Any:
     """Return a table of a recording, one of ``TABLES`` (else KeyError), as an Arrow table."""
     if name not in TABLES:
         raise KeyError(f'there is no table {name!r}: the tables are {", ".join(TABLES)}')
-    import pyarrow
     kind, rows = TABLES[name], getattr(recording, name)
-    arrays, fields = [], []
+    arrays = {}
     for column in kind.names or ():
         if column in _INNER:
             continue
         values = rows[column]
-        metadata = {'unit': 'ns'} if column in _TIMES else None
         array = _names(recording, name, column, values)
         if array is None:
             has_unknown = values.dtype.kind == 'i' and column != 'leg'
             array = numbers(values, values != UNKNOWN if has_unknown else None)
-        arrays.append(array)
-        fields.append(pyarrow.field(column, array.type, metadata=metadata))
-    return pyarrow.table(arrays, schema=pyarrow.schema(
+        arrays[column] = array, 'ns' if column in _TIMES else ''
+    return arrow_of(recording, arrays)
+
+
+def arrow_of(recording: Recording, arrays: Mapping[str, tuple[Any, str]]) -> Any:
+    """Return an Arrow table from arrays by name, each with its unit or an empty text."""
+    import pyarrow
+    fields = [pyarrow.field(name, array.type, metadata={'unit': unit} if unit else None)
+              for name, (array, unit) in arrays.items()]
+    return pyarrow.table([array for array, _ in arrays.values()], schema=pyarrow.schema(
         fields, metadata={'mddag.tables': VERSION, 'mddag.recording': recording.name}))
 
 
@@ -67,12 +69,7 @@ def _names(recording: Recording, table: str, column: str, values: Any) -> Any:
         names, codes = list(_COMPLETES), values
     else:
         return None
-    known = codes >= 0
-    different = list(dict.fromkeys(names))
-    if len(different) < len(names):     # some numbers have the same name
-        place = {name: i for i, name in enumerate(different)}
-        codes = np.array([place[name] for name in names] or [0], dtype=np.int32)[codes]
-    return named(codes, different, known)
+    return named(codes, names, codes >= 0)
 
 
 def numbers(values: Any, known: Any = None) -> Any:
@@ -96,6 +93,10 @@ def _bits(flags: Any) -> Any:
 def named(codes: Any, names: Sequence[str], known: Any = None) -> Any:
     """Return indices of names as an Arrow array, the names as a dictionary."""
     import pyarrow
+    different = list(dict.fromkeys(names))
+    if len(different) < len(names):     # some numbers have the same name
+        place = {name: i for i, name in enumerate(different)}
+        codes, names = np.array([place[name] for name in names])[codes], different
     texts = [name.encode('utf-8', 'backslashreplace') for name in names]
     ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
     return pyarrow.DictionaryArray.from_arrays(
@@ -112,17 +113,12 @@ def _name(recording: Recording, column: str, number: int) -> str:
 
 def pandas_frame(recording: Recording, name: str) -> Any:
     """Return a table of a recording as a pandas data frame; see ``arrow_table``."""
+    return frame_of(arrow_table(recording, name))
+
+
+def frame_of(table: Any) -> Any:
+    """Return an Arrow table as a pandas data frame."""
     import pandas
     import pyarrow
     # pandas' own choice, floats where a value is missing, would round times to 256 ns
-    return arrow_table(recording, name).to_pandas(
-        types_mapper={pyarrow.int64(): pandas.Int64Dtype()}.get)
-
-
-def write_tables(recording: Recording, folder: Path) -> list[str]:
-    """Write each table as a Parquet file into an existing folder; return the file names."""
-    import pyarrow.parquet
-    for name in TABLES:
-        with (folder / f'{name}.parquet').open('wb') as file:
-            pyarrow.parquet.write_table(arrow_table(recording, name), file, compression='zstd')
-    return list(TABLES)
+    return table.to_pandas(types_mapper={pyarrow.int64(): pandas.Int64Dtype()}.get)

@@ -7,11 +7,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 import csv
 import io
+from pathlib import Path
 from typing import Any, BinaryIO
 
 from mddag_executor.analysis.as_recorded import Replay
+from mddag_executor.analysis.result_table import result_tables
 from mddag_executor.errors import MddagError
 from mddag_executor.recording.frames import named, numbers
+from mddag_executor.recording.tables import TABLES
 from mddag_executor.report.columns import Column, executions, jobs
 from mddag_executor.report.text import printable
 import numpy as np
@@ -69,6 +72,19 @@ def write_parquet(file: BinaryIO, columns: Sequence[Column]) -> None:
     """Write Parquet."""
     import pyarrow.parquet
     pyarrow.parquet.write_table(arrow_table(columns), file, compression='zstd')
+
+
+def table_files() -> frozenset[str]:
+    """Return the names of the files that ``write_tables`` writes."""
+    return frozenset(f'{name}.parquet' for name in (*TABLES, *result_tables()))
+
+
+def write_tables(replay: Replay, folder: Path) -> None:
+    """Write each table of a recording and of its results as a Parquet file into a folder."""
+    import pyarrow.parquet
+    for name in (*TABLES, *result_tables()):
+        with (folder / f'{name}.parquet').open('wb') as file:
+            pyarrow.parquet.write_table(replay.to_arrow(name), file, compression='zstd')
 
 
 def check_available(form: str) -> None:

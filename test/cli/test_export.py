@@ -5,7 +5,8 @@
 import os
 from pathlib import Path
 
-from mddag_executor import open_recording
+from mddag_executor import open_recording, replay
+from mddag_executor.analysis.result_table import result_tables
 from mddag_executor.recording.tables import TABLES
 import pytest
 
@@ -17,11 +18,13 @@ def test_the_tables_of_a_recording(tmp_path, call):
     out = tmp_path / 'tables'
     assert call('export', DEMO, '-o', f'{out}/') == (0, f'exported: {out}/\n', '')
     recording = open_recording(DEMO)
-    assert {path.stem for path in out.iterdir()} == set(TABLES)
+    assert {path.stem for path in out.iterdir()} == {*TABLES, *result_tables()}
     for name in TABLES:
         table = parquet.read_table(out / f'{name}.parquet')
         assert table.num_rows == len(getattr(recording, name))
         assert table.schema.metadata[b'mddag.tables'] == b'1'
+    verdicts = parquet.read_table(out / 'verdicts.parquet')
+    assert verdicts.to_pylist() == replay(DEMO).to_arrow('verdicts').to_pylist()
     executions = parquet.read_table(out / 'executions.parquet')
     assert executions.schema.field('start').metadata == {b'unit': b'ns'}
     assert executions['start'].to_pylist() == recording.executions['start'].tolist()
