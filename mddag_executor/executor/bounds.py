@@ -74,7 +74,7 @@ ALONE_NS = 5_000_000_000
 """
 How long it waits at most for another callback of its program, which is not to overlap with it.
 
-If that one waits for it in turn (it may own a lock), the two overlap after this time.
+If that one waits for the first one (which may own a lock), the two overlap after this time.
 """
 
 REJOIN_NS = 100_000_000

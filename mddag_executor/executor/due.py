@@ -167,7 +167,7 @@ class DueTimes:
         """Set the time at which a thread wakes up: one in the epoll, else a parked one."""
         pool = self._pool
         if not pool.polling and not pool.is_stepping:
-            self._timer.at = NEVER  # it may expire: nobody is woken
+            self._timer.at = NEVER  # it may expire, and wakes no thread then
             if pool.running and pool.engine.is_busy:
                 self.look(now)
         elif not pool.running:

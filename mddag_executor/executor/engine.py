@@ -1037,7 +1037,7 @@ class Engine:
             self.record('judge_from', now, get_native_id(), release)
 
     def requirements(self, now: int) -> dict[str, Any]:
-        """Return the results of what is required of paths, see ``PathWatch.result``."""
+        """Return the results of the requirements of paths, see ``PathWatch.result``."""
         return {} if self.path_watch is None else self.path_watch.result(
             min(now, self._ended), self._state.scalars[JUDGE_FROM])
 

@@ -4,7 +4,7 @@
 Whether the execution that holds the interpreter computes, while something waits for it.
 
 If it waits for anything else, it gives the interpreter up (``gil``, 4 and 5).  A paused thread
-checks this itself (``pausing``), so nobody else does meanwhile.
+checks this itself (``pausing``), so no other thread does meanwhile.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ def clear_listener(kind: str, address: int, fd: int) -> None:
 
 
 def announce_trigger(address: int) -> None:
-    """Write for a guard condition that has been triggered; also in a signal handler."""
+    """Write for a guard condition that has been triggered; a signal handler may call this."""
     for fd in _GUARDS.get(address, ()):
         announce(fd)
 

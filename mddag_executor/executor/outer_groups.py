@@ -31,7 +31,7 @@ class OuterGroup:
 
     :param create_task_in: the executor's method that makes tasks of a group.
     :ivar number: in the core.
-    :ivar n_nested: how many of its callbacks wait in a call or a spin of theirs.
+    :ivar n_nested: how many of its callbacks wait in a call, or spin an executor themselves.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class OuterGroup:
                 pool.engine.free_outer_group(pool.freed_outer_groups.popleft())
             self.number = pool.engine.new_outer_group()
         pool.outer_groups[self.number] = self
-        # A finalizer may come anywhere, also in a thread that has the lock.
+        # Any thread may call the finalizer, even one that owns the lock.
         weakref.finalize(self, pool.freed_outer_groups.append, self.number).atexit = False
         self.n_nested = 0
         # what ``open`` has set
@@ -74,7 +74,7 @@ class OuterGroup:
         return may_start
 
     def n_running(self) -> int:
-        """Return how many callbacks run now, also those that wait in a call or spin of theirs."""
+        """Return how many callbacks run, including those that wait in a call or in a spin."""
         with self._pool.lock:
             return self._pool.n_running_of(self.number)
 

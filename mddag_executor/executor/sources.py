@@ -110,7 +110,7 @@ class SubscriptionEntity(ArrivalEntity):
         return self.callback is None or self.source >= 0 or bool(self.remote_publishers)
 
     def listen(self, rooms: Rooms) -> None:
-        """Let messages be collected, also by publishing threads of this process."""
+        """Let workers and publishing threads of this process collect messages."""
         subscription, pool = self.rclpy_object, rooms.pool
         if compat.is_of_wait_for_message(subscription):
             return

@@ -6,10 +6,9 @@ Waitables (actions, QoS events, and user-defined ones), and guard conditions.
 Theory of operation
 -------------------
 1.  A waitable consists of rcl entities, which a wait set contains after the waitable has been
-    added to it.  Each of these gets the listener of its kind (``listeners``), also a guard
-    condition, whose trigger is wrapped for this (``publishing``).  So nothing waits in a wait set.
-    After an arrival the waitables are asked with their own wait set, which does not wait
-    (``WaitableSource``).
+    added to it.  Each of these entities gets the listener of its kind (``listeners``).  rcl has
+    none for guard conditions, so their trigger is wrapped (``publishing``).  After an arrival the
+    waitable is asked with its own wait set, which does not wait (``WaitableSource``).
 2.  Each waitable and each guard condition has a source of its own.  Only QoS events share one, as
     they are rare.
 3.  Setting the listener of a QoS event marks earlier events as known, so a wait set does not
@@ -17,10 +16,10 @@ Theory of operation
     dropped.
 4.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next.
 5.  *The exception* is a thread that waits in a wait set (``WaitSetThread``).  It waits for rclpy's
-    signal condition: rclpy's handler of SIGTERM is C++, triggers the condition without Python, and
-    writes to no descriptor.  It also waits for a waitable that contains no entity, or one for
-    which the middleware has no listener.  A waitable without any entity is ready when it says so:
-    it is asked whenever the executor is woken (``Executor.wake``).
+    signal condition, because rclpy's handler of SIGTERM is written in C++: it triggers the
+    condition without Python, and writes to no descriptor.  The thread also waits for waitables
+    for which the middleware has no listener, and for waitables without any entity.  The latter
+    are asked whenever the executor is woken (``Executor.wake``).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ Theory of operation
     the process has computed nothing, it goes on without a worker; as it does when a spin ends, or
     in ``spin_once``, where only one callback runs.
 7.  *Coroutines.*  A coroutine that waits for a future is suspended.  It keeps its callback group
-    but no worker.  When the future is done, it becomes ready again, too.
+    but no worker.  When the future is done, the coroutine also becomes ready again.
 8.  *Errors.*  An exception of a callback or of a thread of the pool goes to ``fail`` and ends the
     spin.
 """
@@ -282,7 +282,7 @@ class WorkerPool:
         #: how many threads wait for events
         self.polling = 0
         self._n_parked = 0
-        # how many callbacks are known to wait for whom messages or requests may come
+        # how many callbacks are known to wait, and may get messages or requests
         self._eager = 0
         self._polled_at = 0  # when the epoll was last polled
         self._waiting_calls = 0
@@ -930,7 +930,7 @@ class WorkerPool:
             self.unlocked_calls.append(partial(self._resume_after, work, outcome))
         else:
             is_gone = isinstance(outcome, Destroyed)
-            if is_over(self.context):  # this may destroy nodes, too
+            if is_over(self.context):  # this may also destroy nodes
                 engine.left_open(work, start, end, me.vtid, worker, not is_gone)
             elif is_gone:
                 engine.destroyed(work, now)
