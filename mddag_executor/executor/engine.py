@@ -221,13 +221,15 @@ class Engine:
         entity = work.entity
         if entity.removed or self._finished:
             return
+        release = max(entity.since, min(due, now))
         if entity.depth and len(entity.waiting) >= entity.depth:
             entity.skipped += 1
             if entity.source >= 0:
-                self._skip_job(entity, max(entity.since, min(due, now)), now)
+                self._skip_job(entity, release, now)
         elif entity.source >= 0 and not self._is_over(self.tables.dag_of[entity.source]):
-            self._start_job(work, max(entity.since, min(due, now)), now)
+            self._start_job(work, release, now)
         else:
+            work.due_ns = release
             self.ready(work, now)
 
     def _is_over(self, dag: int) -> bool:
@@ -982,7 +984,7 @@ class Engine:
             deadline = self.release_of(work) + self.tables.rad_offset[vertex]
         self.record(
             'dispatch', time, vtid, work.entity.address, dag, index, job, worker, work.ready_ns,
-            deadline)
+            deadline, work.due_ns)
 
     def _record_waiting(self, now: int) -> None:
         """Record what waits at the end as dispatched then: a reader sees that it was not lost."""

@@ -98,6 +98,7 @@ class Work:
     :ivar sent: its publications on topics of ``PathWatch.topics``, with their times.
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
+    :ivar due_ns: when its timer was due, on the trace's clock; 0: it is of no timer.
     :ivar cpu_ns: its CPU time.
     :ivar coroutine: its ``coroutines.Steps``, if it is one and has begun.
     :ivar paused_ns: for how long it has paused since it was dispatched.
@@ -106,7 +107,7 @@ class Work:
 
     __slots__ = (
         'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
-        'ready_ns', 'cpu_ns', 'yields', 'paused_ns', 'answers', 'published', 'sent')
+        'ready_ns', 'due_ns', 'cpu_ns', 'yields', 'paused_ns', 'answers', 'published', 'sent')
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -122,7 +123,7 @@ class Work:
         self.published: frozenset[str] = frozenset()
         self.sent: tuple[tuple[str, int], ...] = ()
         self.x = self.worker = -1
-        self.ready_ns = self.cpu_ns = self.yields = self.paused_ns = 0
+        self.ready_ns = self.due_ns = self.cpu_ns = self.yields = self.paused_ns = 0
 
     def step(self, must_check: bool = True) -> Any:
         """

@@ -80,7 +80,8 @@ class Callback:
     A timer, subscription or service of a recording, with its callback.
 
     :ivar number: identifies the callback; 0: no callback is recorded.
-    :ivar kind: ``timer``, ``subscription``, ``service`` or ``unknown``.
+    :ivar kind: ``timer``, ``subscription``, ``service``, ``other`` (an action, a task, …; it has
+        only a symbol) or ``unknown``.
     :ivar start: topic or name of the service; empty for timers.
     :ivar period: of its timer, ns; 0 for others.
     :ivar made: when its timer, subscription or service was created, ns.
@@ -336,9 +337,13 @@ class Entities:
         """Return the callback that an event at run time means; create an unknown one if needed."""
         found = self.callbacks.latest(pid, address, time)
         if found is None:
-            found = Callback(None, 'unknown', made=time)
+            # an action, a task or a guard condition has only a symbol
+            symbol = self._symbols.get(signed(address), '')
+            found = Callback(None, 'other' if symbol else 'unknown', made=time)
+            found.symbol = symbol
             self._number(found, address)
-            found.label = f'callback {found.number} of process {pid}, whose start is not recorded'
+            found.label = symbol or (
+                f'callback {found.number} of process {pid}, whose start is not recorded')
             self.callbacks.add(pid, address, time, found)
         return found
 

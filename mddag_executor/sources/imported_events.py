@@ -54,7 +54,7 @@ KINDS: dict[str, tuple[Any, ...]] = {
 }
 """By full name of an event its kind, and the fields of its columns ``a``, ``b``, …"""
 OWN_KINDS: dict[str, tuple[Any, ...]] = {
-    'mddag:dispatch': (READY, 'callback', 'ready'), 'mddag:shutdown': (SHUTDOWN, 'end'),
+    'mddag:dispatch': (READY, 'callback', 'ready', 'due'), 'mddag:shutdown': (SHUTDOWN, 'end'),
     'ros2:rmw_take': (
         TAKE, 'rmw_subscription_handle', 'source_timestamp', 'taken', 'sequence_number')}
 """The same of this executor's own events, for a trace without declaration."""

@@ -61,7 +61,7 @@ import numpy as np
 
 _SLACK_NS = 1_000_000
 _OWN = ('mddag:job_release', 'mddag:dispatch')
-_OFF_THE_GRID = {
+OFF_THE_GRID = {
     'off': ('execution', 'of timers off the grid of the period (reset, by another clock, or '
             'without initialisation in it): released when it started'),
     'skipped': ('period', 'of timers passed without an execution (late by more than one, '
@@ -81,6 +81,7 @@ class ImportedRun:
     kinds = KINDS
     others: Sequence[str] = (*INIT_EVENTS, *_OWN)
     links_type = Links
+    odd = OFF_THE_GRID
 
     def __init__(
         self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
@@ -93,7 +94,7 @@ class ImportedRun:
                 reader, self.kinds, self.others, progress)
         give_back()     # memory of the batches
         starts = self._starts()
-        init = [event for event in self._events.others if event[0].name not in _OWN]
+        init = self._initialisation()
         # this executor recorded it, but its executions are lost
         own = any(event[0].name in _OWN for event in self._events.others)
         if head is None and (own or not len(starts)):
@@ -102,7 +103,7 @@ class ImportedRun:
         self._clocks = ImportedClocks(self.links)
         if self._clocks.shift:
             self._events = moved(self._events, self._clocks.shift)
-            self._link([event for event in self._events.others if event[0].name not in _OWN])
+            self._link(self._initialisation())
             starts = self._starts()
         threads = {self._events.threads[each] for each in np.unique(starts['thread']).tolist()}
         # The policy of another executor is not recorded; its name replaces the pool.
@@ -119,8 +120,11 @@ class ImportedRun:
         #: The last event's time, ns.
         self.end = max(min(max(0, self.head.time), NEVER - 1),
                        int(self._events.table['time'].max(initial=0)))
-        self._odd = Losses(_OFF_THE_GRID, 5)
+        self._odd = Losses(self.odd, 5)
         self._fallbacks: Counter[str] = Counter()
+
+    def _initialisation(self) -> list[Event]:
+        return [event for event in self._events.others if event[0].name in INIT_EVENTS]
 
     def _starts(self) -> Table:
         table = self._events.table

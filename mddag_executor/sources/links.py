@@ -129,8 +129,8 @@ class Lost(NamedTuple):
 
 _RUN = np.dtype([
     ('callback', 'i8'), ('at', 'i8'), ('end_at', 'i8'), ('thread', 'i8'), ('start', 'i8'),
-    ('end', 'i8'), ('ready', 'i8'), ('stamp', 'i8'), ('stated', 'i8'), ('taken', 'i8'),
-    ('message', 'i8')])
+    ('end', 'i8'), ('ready', 'i8'), ('due', 'i8'), ('stamp', 'i8'), ('stated', 'i8'),
+    ('taken', 'i8'), ('message', 'i8')])
 _MESSAGE = np.dtype([
     ('at', 'i8'), ('publisher', 'i8'), ('run', 'i8'), ('time', 'i8'), ('stamp', 'i8'),
     ('message', 'i8'), ('header', 'i8'), ('within', '?')])
@@ -144,8 +144,9 @@ class Links:
 
     :ivar runs: executions in the order of their starts: ``callback`` (index of ``callbacks``),
         ``at`` and ``end_at`` (events; -1: no end), ``thread``, ``start``, ``end``, ``ready`` (-1:
-        not recorded), ``stamp`` and ``stated`` (source and header stamp of its message, 0:
-        unknown), ``taken`` (when the message was taken; 0: unknown), ``message`` (-1: unknown).
+        not recorded), ``due`` (of a timer; 0: not recorded), ``stamp`` and ``stated`` (source and
+        header stamp of its message, 0: unknown), ``taken`` (when the message was taken; 0:
+        unknown), ``message`` (-1: unknown).
     :ivar messages: publications: ``at`` (event), ``publisher`` (index of ``publishers``, -1:
         unknown), ``run`` (-1: none), ``time``, ``stamp`` and ``header`` (source and header stamp,
         0: unknown), ``within`` (only within the process).

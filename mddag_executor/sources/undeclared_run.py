@@ -15,10 +15,14 @@ the causes of executions.  Differences:
    is not recorded.  A timestamp belongs to a publication of its topic that was being sent then: it
    had begun, and its thread had neither published again nor ended its callback.  If several
    publications fit, the number of the message decides (``stamps``).
-3. *Ready* is recorded.  A timer's release is the last time on its period's grid.  The grid's
-   origin is not recorded.  It is the earliest time at which the timer was noticed, if half of the
-   releases on that grid were noticed shortly after they were due; otherwise a release is the time
-   at which it was noticed.
+3. *Ready* is recorded, and so is the due time of a timer, which is its release.  Version 2 did
+   not record the due time.  In its traces a timer's release is the last time on its period's grid,
+   whose origin is found as follows.  When a timer was noticed, the periods that had passed were
+   skipped.  So a due time lies between two successive moments at which it was noticed, which
+   excludes an origin if they are closer than a period.  Of the origins that (nearly) no moment
+   excludes, that of the least total lateness is chosen.  If every origin is excluded, or none is
+   and few releases were noticed soon, the timer kept no grid: a release is the time at which it
+   was noticed.
 4. The pieces of a coroutine became ready at the same time.  They are one execution, which
    completes at the end of the last piece.
 """
@@ -51,7 +55,7 @@ from mddag_executor.sources.imported_events import (
     TAKE,
 )
 from mddag_executor.sources.imported_jobs import ImportedJobs
-from mddag_executor.sources.imported_run import ImportedRun
+from mddag_executor.sources.imported_run import ImportedRun, OFF_THE_GRID
 from mddag_executor.sources.links import Links
 from mddag_executor.sources.stamps import find_stamps, Sent
 from mddag_executor.trace.times import NEVER
@@ -60,6 +64,8 @@ import numpy as np
 _DROP, _MESSAGES_LOST = 'mddag:drop', 'mddag:messages_lost'
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
+# Of so many releases one may exclude the origin of the grid, and one has to exclude others.
+_ONE_OF = 20
 
 
 class _OwnLinks(Links):
@@ -129,6 +135,8 @@ class _OwnLinks(Links):
         known = (last >= 0) & ready[last]
         start = self.runs['start']
         self.runs['ready'] = np.where(known, np.clip(table['b'][last], 0, start), start)
+        due = np.where(known, table['c'][last], 0)
+        self.runs['due'] = np.where((due > 0) & (due <= self.runs['ready']), due, 0)
         found: Ints = np.where(known, self._taken_at[last], -1)
         return found
 
@@ -139,6 +147,9 @@ class UndeclaredRun(ImportedRun):
     kinds = {**KINDS, **OWN_KINDS}
     others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST)
     links_type = _OwnLinks
+    odd = {**OFF_THE_GRID, 'off': (
+        'execution', 'of timers whose due times are not recorded and that kept to no period '
+        '(reset, or by another clock): released when they were noticed')}
 
     def read(self) -> Recording:
         """Return the recording."""
@@ -176,17 +187,19 @@ class UndeclaredRun(ImportedRun):
 
     def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
         number, ready = self.links.runs['callback'], self.links.runs['ready'].copy()
+        due = self.links.runs['due']
         for callback, mine in zip(
                 self.links.callbacks, rows_by(number, len(self.links.callbacks))):
-            times = np.unique(ready[mine])
+            times = np.unique(ready[mine[due[mine] == 0]])
             if callback.kind == 'timer' and len(times):
                 callback.grid = _grid(times, callback.period)
         # the time at which a request was taken is not recorded
         release = self._releases(jobs, ready, 'timer', 'service')
         timer = self._is_any('timer')[number[jobs.sources]]
+        timer &= due[jobs.sources] == 0
         mine = jobs.sources[timer]
         release[timer] = self._due(mine, ready[mine])
-        return ready, release
+        return ready, np.where(due[jobs.sources] > 0, due[jobs.sources], release)
 
     def _pieces(self) -> tuple[Ints, Mask]:
         """Return the first pieces of executions, and which end them (rule 4)."""
@@ -203,16 +216,30 @@ def _grid(ready: Ints, period: int) -> int | None:
     """
     Return a time on the grid of a timer's releases, before them; None: no grid (rule 3).
 
-    :param ready: when it was noticed.
+    :param ready: when it was noticed, ascending.
     """
     if not 0 < period < NEVER:
         return None
-
-    def late(since: int) -> Ints:
-        found: Ints = (ready - since + period // 2) % period - period // 2
-        return found
-
-    usual = int(ready[0]) + int(np.median(late(int(ready[0]))))
-    first = usual + int(late(usual).min())
-    soon = (ready - first) % period <= min(_SOON_NS, period // _SOON_PART)
-    return first - 2 * period if 2 * soon.sum() >= len(ready) else None
+    phase = (ready - ready[0]) % period
+    origins = np.unique(phase)
+    n = len(origins)
+    # an origin in (the later moment, the earlier one] is excluded
+    close = np.flatnonzero(np.diff(ready) < period)
+    begin, until = (np.searchsorted(origins, phase[each], 'right') for each in (close + 1, close))
+    changes = np.zeros(n + 1, dtype=np.int64)
+    np.add.at(changes, begin, 1)
+    np.add.at(changes, until, -1)
+    changes[0] += (begin > until).sum()
+    excluding = np.cumsum(changes)[:n]
+    # how late the timer was noticed altogether, by origin: less by each step, more at each moment
+    steps = np.diff(origins, prepend=0)
+    passed = np.searchsorted(np.sort(phase), origins)
+    late = phase.sum() - len(ready) * np.cumsum(steps) + period * passed
+    allowed = np.flatnonzero(excluding * _ONE_OF <= len(ready))
+    if not len(allowed):
+        return None
+    origin = int(origins[allowed[np.argmin(late[allowed])]])
+    soon = (phase - origin) % period <= min(_SOON_NS, period // _SOON_PART)
+    if len(close) * _ONE_OF < len(ready) and 2 * soon.sum() < len(ready):
+        return None
+    return int(ready[0]) + origin - 2 * period

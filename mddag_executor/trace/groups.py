@@ -32,7 +32,7 @@ _VALUES = {
 
 GROUPS = {
     EXECUTION: {
-        'mddag:dispatch': 'start callback dag vertex job worker ready deadline',
+        'mddag:dispatch': 'start callback dag vertex job worker ready deadline none',
         'ros2:callback_start': 'start callback none',
         'ros2:callback_end': 'end callback',
         'mddag:complete':

@@ -145,8 +145,9 @@ _ALL = (
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
-    _event('mddag', 'dispatch', callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
-           ready=_I64, reference_deadline=_I64),
+    # the due time of a timer that belongs to no job, 0: unknown
+    _event('mddag', 'dispatch', (0,), callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
+           ready=_I64, reference_deadline=_I64, due=_I64),
     # the CPU time of the execution, -1: unknown, and whether it held the GIL
     _event('mddag', 'complete', (-1, False),
            callback=_U64, dag=_I32, vertex=_I32, job=_I64, last_leg=_BOOL, completed=_I64,

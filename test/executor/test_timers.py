@@ -10,6 +10,7 @@ import time
 from builtin_interfaces.msg import Time as TimeMessage
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor import open_recording
 from mddag_executor.core import NEVER
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.listeners import TimerFd
@@ -315,11 +316,11 @@ def test_periods_before_the_spin_are_no_jobs_and_no_misses(make_executor, make_n
     assert statistics['dags']['ticks']['jobs'] >= round((last - first) / 1e7) + 1
 
 
-@pytest.mark.parametrize('records', [False, True])
+@pytest.mark.parametrize('declared', [False, True])
 def test_a_release_is_the_due_time_even_if_that_was_after_the_turn_began(
-        make_executor, make_node, records, tmp_path):
+        make_executor, make_node, declared, tmp_path):
     """A thread may lose its processor between its wake-up and the next timer."""
-    node, releases, first, second = make_node(), {}, [], []
+    node, first, second = make_node(), [], []
 
     def one():
         first.append(1)
@@ -330,19 +331,21 @@ def test_a_release_is_the_due_time_even_if_that_was_after_the_turn_began(
     node.create_timer(0.01, one)
     time.sleep(0.005)
     node.create_timer(0.01, two)
-    executor = make_executor(
-        loads(graph(node="""
-            name: one, timer: 10ms, dag: a, deadline: 10s
-            name: two, timer: 10ms, dag: b, deadline: 10s""")), nodes=[node],
-        trace=str(tmp_path / 'trace.mcap') if records else None)
-    executor._engine.verdicts.on_release = (
-        lambda dag, release: releases.setdefault(dag, []).append(release))
+    task_set = loads(graph(node="""
+        name: one, timer: 10ms, dag: a, deadline: 10s
+        name: two, timer: 10ms, dag: b, deadline: 10s"""))
+    trace = str(tmp_path / 'trace.mcap')
+    executor = make_executor(task_set if declared else None, nodes=[node], trace=trace)
     handle = executor._pool.due.handle
     executor._pool.due.handle = lambda *each: (time.sleep(0.012), handle(*each))
     with Spinning(executor):
         assert wait_for(lambda: len(first) >= 10 and len(second) >= 10)
-    assert len(releases) == 2
-    for each in releases.values():
+    executor.shutdown(5.0)
+    recording = open_recording(trace, None if declared else task_set)
+    assert not any('due times' in each for each in recording.warnings)
+    for dag in range(2):
+        each = recording.releases['release'][recording.releases['dag'] == dag].tolist()
+        assert len(each) >= 10
         grid = each[len(each) // 2]
         # the first one is released when the executor begins to manage the timer
         assert all(min((at - grid) % (10 * MS), (grid - at) % (10 * MS)) < MS for at in each[1:])
