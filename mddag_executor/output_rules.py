@@ -3,11 +3,12 @@
 """
 What an output may replace: the one rule for all verbs and for the Python API.
 
-1. A recording cannot be made again. So a new recording replaces no file, and no other output
-   replaces a file that holds a recording, unless the user asks for it: `--overwrite` on the
-   command line, `overwrite=True` in Python.
+1. A recording cannot be made again, and a declaration may have been edited. So a new recording or
+   declaration replaces no file unless the user asks for it: `--overwrite` on the command line,
+   `overwrite=True` in Python. No other output replaces a file that holds a recording or is named
+   like a declaration.
 2. An output is never an input of the same command, and no two outputs are the same file.
-3. Other results (tables, pictures, declarations) replace what was there, as with every tool.
+3. Other results (tables, pictures) replace what was there, as with every tool.
 4. Pipes, devices and empty files hold nothing that could be lost.
 5. A folder of results replaces a folder that is empty or holds files with the names of such
    results only: those of an earlier command, or what a killed one left. Other folders stay.
@@ -30,16 +31,22 @@ EXISTS = 'there is a file already'
 REMEDY = 'name another file, or replace this one with --overwrite (in Python overwrite=True)'
 _RECORDINGS = (b'\x89MCAP', b'SQLite format 3\0')
 _ENDINGS = ('.mcap', '.db3')
+_DECLARATIONS = ('.yaml', '.yml')
 
 
-def check_replaced(path: str, *, recording: bool, overwrite: bool = False) -> None:
-    """Raise InputError if an output may not replace an existing file (rule 1)."""
+def check_replaced(path: str, *, is_kept: bool, overwrite: bool = False) -> None:
+    """
+    Raise InputError if an output may not replace an existing file (rule 1).
+
+    :param is_kept: whether the output is a recording or a declaration.
+    """
     if overwrite or not holds_data(path):
         return
-    if recording:
+    if is_kept:
         raise InputError(path, EXISTS, REMEDY)
-    if is_recording(path):
-        raise InputError(path, 'this file is a recording', 'name another file for the result')
+    for what, is_such in (('recording', is_recording), ('declaration', is_declaration)):
+        if is_such(path):
+            raise InputError(path, f'this file is a {what}', 'name another file for the result')
 
 
 def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
@@ -145,6 +152,11 @@ def is_recording(path: str) -> bool:
             return file.read(16).startswith(_RECORDINGS)
     except OSError:
         return False
+
+
+def is_declaration(path: str) -> bool:
+    """Return whether a file is named like a declaration."""
+    return path.lower().endswith(_DECLARATIONS)
 
 
 def _same_file(one: str, other: str) -> bool:

@@ -25,6 +25,7 @@ from mddag_executor.output_rules import (
     check_distinct,
     check_replaced,
     check_results,
+    is_declaration,
     is_special,
     remove_results,
     whole_file,
@@ -96,7 +97,7 @@ def recording_and_graph(args: argparse.Namespace) -> None:
     The last one is the declaration if it is named like one, or is standard input.
     """
     traces = args.trace
-    if len(traces) > 1 and (traces[-1] == '-' or is_graph(traces[-1])):
+    if len(traces) > 1 and (traces[-1] == '-' or is_declaration(traces[-1])):
         *traces, args.graph = traces
     args.trace = one_run(traces, args.offset)
 
@@ -138,11 +139,6 @@ def _traces_in(path: str) -> Sequence[str]:
     return [path]
 
 
-def is_graph(path: str) -> bool:
-    """Return whether a file is named like a declaration."""
-    return path.lower().endswith(('.yaml', '.yml'))
-
-
 def _stdin() -> BinaryIO:
     if sys.stdin is None:
         raise UsageError("-: there is no standard input: name a file instead of '-'")
@@ -163,7 +159,7 @@ def check_files(args: argparse.Namespace) -> None:
         if isinstance(each, NamedFile) and each == '-':
             raise UsageError(f'--{name} -: it cannot be written to standard output: name a file')
         if isinstance(each, Output) and each.checked_early:
-            check_output(each, each.is_recording, getattr(args, 'overwrite', False))
+            check_output(each, each.is_kept, getattr(args, 'overwrite', False))
         if isinstance(each, Report):
             _check_report(each)
 
@@ -175,15 +171,19 @@ def _files(args: argparse.Namespace) -> Iterator[tuple[str, Input | Output]]:
                 yield name.replace('_', ' '), each
 
 
-def check_output(path: str | None, recording: bool = False, overwrite: bool = False) -> None:
-    """Check that a file can be written: `-` always; a recording may need `overwrite`."""
+def check_output(path: str | None, is_kept: bool = False, overwrite: bool = False) -> None:
+    """
+    Check that a file can be written: `-` always.
+
+    :param is_kept: whether it is a recording or a declaration, which may need `overwrite`.
+    """
     if path is None or path == '-':
         return
     if os.path.isdir(path):
         raise InputError(path, 'this is a directory', 'name a file')
     if not is_special(path):
         _check_parent(path)
-        check_replaced(path, recording=recording, overwrite=overwrite)
+        check_replaced(path, is_kept=is_kept, overwrite=overwrite)
 
 
 def _check_report(path: Report) -> None:

@@ -43,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '-o', '--output', metavar='OUT', default='-',
         help="the declaration ('-': standard output, the default); with --sets a new folder")
+    options.add(parser, '--overwrite')
     parser.add_argument('--sets', type=options.positive_int, metavar='N',
                         help='make N task sets, OUT/set_0000.yaml and so on')
     add('--dags', whole, 'N[:N]', 'number of DAGs')
@@ -78,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
     for each in (every[0], every[-1]):
         each.check()
     if args.sets is None:
-        common.check_output(args.output)
+        common.check_output(args.output, is_kept=True, overwrite=args.overwrite)
         common.write_text(args.output, generate(every[0]))
         return 0
     if args.output == '-':

@@ -34,7 +34,7 @@ REMOVED_OPTIONS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    options.add(parser, 'graph', '--output', '--workers', '--duration', '--json')
+    options.add(parser, 'graph', '--output', '--overwrite', '--workers', '--duration', '--json')
     add('--budget', choices=defaults.BUDGETS, default='p99',
         help='which value of each execution time makes the critical path (default: %(default)s)')
     options.add(parser, '--policy', only='to simulate, ')

@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='measure rates and execution times in this recording: a trace '
                         "(MCAP; '-': standard input), or the folder of a session that LTTng "
                         'recorded (needs python3-bt2)')
-    options.add(parser, '--output')
+    options.add(parser, '--output', '--overwrite')
 
 
 def main(args: argparse.Namespace) -> int:

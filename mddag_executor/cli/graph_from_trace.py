@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'a deadline is the period of the source that leads to the sink; what was '
                         'not seen to be published is not, and a source without a measured rate '
                         'is left out')
-    options.add(parser, '--output')
+    options.add(parser, '--output', '--overwrite')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -41,9 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--processes', type=options.positive_int, required=True, metavar='N',
         help='how many processes')
-    add('-o', '--output', metavar='PLACED.yaml', type=options.Output, required=True,
+    add('-o', '--output', metavar='PLACED.yaml', type=options.Declaration, required=True,
         help="the declaration to write ('-': to standard output)")
-    options.add(parser, 'graph', '--json')
+    options.add(parser, '--overwrite', 'graph', '--json')
     add('trace', metavar='TRACE', type=options.Input, nargs='*',
         help='use the execution times of this recorded run, and which callbacks compute in Python '
         'there (default: as declared); for a run of several processes the traces of all')

@@ -114,7 +114,7 @@ class Input(str):
 class Output(str):
     """A file to write, `-` for standard output; `common.check_files` checks it early."""
 
-    is_recording = False    # see `output_rules`
+    is_kept = False         # see `output_rules`
     checked_early = True
 
 
@@ -126,16 +126,22 @@ class NamedFile(Output):
     """A file to write that cannot be standard output."""
 
 
+class Declaration(Output):
+    """A declaration to write."""
+
+    is_kept = True
+
+
 class Bag(Output):
     """A bag to write."""
 
-    is_recording = True
+    is_kept = True
 
 
 class Trace(NamedFile):
     """A trace to write."""
 
-    is_recording = True
+    is_kept = True
 
 
 class TraceOfRun(Trace):
@@ -157,7 +163,7 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'metavar': 'GRAPH', 'type': Input,
         'help': "the declaration, a YAML file ('-': standard input)"},
     '--output': {
-        'metavar': 'GRAPH', 'type': Output, 'default': '-',
+        'metavar': 'GRAPH', 'type': Declaration, 'default': '-',
         'help': "the declaration ('-': standard output, the default)"},
     '--json': {
         'metavar': 'FILE', 'type': Output,
@@ -215,7 +221,7 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         "of RUN.NAME.mcap, or a trace) is ahead of the first trace's, for instance 2.5ms, or "
         '-2.5ms if it is behind', 'otherwise': 'estimated from messages in both directions'},
     '--overwrite': {
-        'action': 'store_true', 'help': 'replace an existing recording'},
+        'action': 'store_true', 'help': 'replace an existing recording or declaration'},
     '--ros-args': {
         'nargs': argparse.REMAINDER, 'metavar': '…',
         'help': 'pass the rest of the command line to rclpy.init, for instance -r from:=to'},

@@ -211,7 +211,7 @@ def run_here(
     :param finish: gets the result (with what those of several processes are put together from, if
         it is one of these), and what a node raised; returns the exit status.
     """
-    common.check_output(args.trace, recording=True, overwrite=args.overwrite)
+    common.check_output(args.trace, is_kept=True, overwrite=args.overwrite)
     trace = None if args.trace is None else Path(args.trace).absolute()  # nodes may change folders
     workers = defaults.workers(args.workers, task_set)
     plan = None

@@ -71,7 +71,7 @@ def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
         _warn_of_divided_paths(task_set)
         for name in names:
             common.check_output(
-                _trace(args.trace, name), recording=True, overwrite=args.overwrite)
+                _trace(args.trace, name), is_kept=True, overwrite=args.overwrite)
         if plan is not None:
             warn_of(plan, len(names))
 

@@ -19,6 +19,7 @@ from mddag_executor.cli import common, options, recorded, simulate, verdicts
 from mddag_executor.cli.text import Progress, warn
 from mddag_executor.core.tally import total
 from mddag_executor.errors import UsageError
+from mddag_executor.output_rules import is_declaration
 
 if TYPE_CHECKING:
     from mddag_executor.results.sinks import DagCounts
@@ -62,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.report.slack import lines, page
     from mddag_executor.whatif.slack import find_slack, slack_result
     common.recording_and_graph(args)
-    is_graph = common.is_graph(str(args.trace))
+    is_graph = is_declaration(str(args.trace))
     problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
     common.leave_out_paths('slack', task_set)
     callbacks = len(set(problem.callback_of))

@@ -81,7 +81,7 @@ def rerun(
                if path is not None]
     check_distinct([('recording', os.fspath(recording))], written)
     for _, path in written:
-        check_replaced(path, recording=True, overwrite=overwrite)
+        check_replaced(path, is_kept=True, overwrite=overwrite)
     messages, taken = open_input(
         os.fspath(recording), task_set, None if times is None else os.fspath(times), seed)
     with ExitStack() as files:

@@ -18,6 +18,8 @@ from mddag_executor.rerun import rerun
 from mddag_executor.trace import TraceFile, TraceWriter
 import pytest
 
+DEMO = Path(__file__).parents[2] / 'bags' / 'demo_short.mcap'
+
 
 def test_what_is_replaced(graph, call):
     simulate = ['simulate', 'graph.yaml', '--duration', '50ms', '--trace', 'run.mcap']
@@ -30,6 +32,19 @@ def test_what_is_replaced(graph, call):
     assert call('replay', 'run.mcap', '--json', 'result.json')[0] == 0
     assert 'dags' in json.loads(Path('result.json').read_text())
     assert call('replay', 'run.mcap', '--json', '/dev/null', '--junit', '/dev/null')[0] == 0
+
+
+def test_a_declaration_is_replaced_only_if_that_is_asked_for(graph, call):
+    edited = Path('edited.yaml')
+    for verb in (f'from-trace {DEMO}', f'assign-deadlines {graph} --runs 1',
+                 f'place {graph} --processes 1'):
+        edited.write_text('edited')
+        words = ['graph', *verb.split(), '-o', str(edited)]
+        status, _, err = call(*words)
+        assert status == 2 and err.startswith('error: edited.yaml: there is a file already: name')
+        assert edited.read_text() == 'edited'
+        done = call(*words, '--overwrite')
+        assert done[0] == 0 and edited.read_text() != 'edited', done
 
 
 def test_in_python_no_recording_is_replaced(graph, call, ros_context):
