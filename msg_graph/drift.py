@@ -9,9 +9,9 @@ The rules are the same for live runs and recordings. Observations are counts by 
 
 1. *publishes*: a callback published a topic that it does not declare. Topics of the client library
    do not count.
-2. *rate* of a source: the mean time between two releases differs from the declared period by more
-   than ``TOLERANCE`` of it. At least ``LEAST`` releases are needed. A sporadic source may be
-   released less often.
+2. *rate* of a source: its timer was created with another period, or the mean time between two
+   releases differs from the declared period by more than ``TOLERANCE`` of it. At least ``LEAST``
+   releases are needed. A sporadic source may be released less often.
 3. *rate* of a subscription: it received messages more or less often than the callbacks that
    publish them ran here, by more than ``TOLERANCE``. At least ``LEAST`` expected messages are
    needed. Dropped messages count as received: their loss is no fault of the declaration. Syncs
@@ -34,7 +34,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from msg_graph.binding import Entity, is_background, suggest_entity
+from msg_graph.binding import Entity, is_background, is_period, suggest_entity
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
 from msg_graph.model import (
@@ -83,6 +83,7 @@ class Observed:
     :ivar publishes: by callback, the topics that it published, declared or not.
     :ivar nodes: the nodes that were seen; None if unknown.
     :ivar undeclared: the undeclared entities that were seen.
+    :ivar periods: by timer, the period with which it was created, ns; without unknown ones.
     """
 
     duration_ns: int = 0
@@ -93,6 +94,7 @@ class Observed:
     publishes: dict[str, Set[str]] = field(default_factory=dict)
     nodes: Set[str] | None = None
     undeclared: Sequence[Entity] = ()
+    periods: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,7 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
     if topic is None and (observed.got.get(callback.key, 0) or due is not None and due < 2):
         return None     # the callbacks before it, or its own executions, were late or dropped
     text = (f'{callback.key} never {"ran" if topic is None else f"got a message of {topic}"} in '
-            f'{observed.duration_ns / 1e9:.3f} s')
+            f'the {observed.duration_ns / 1e9:.3f} s after the first release')
     question = suggest_entity(
         callback if topic is None else replace(callback, kind='subscription', topics=(topic,)),
         observed.undeclared)
@@ -196,6 +198,12 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
 
 
 def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift | None:
+    created = observed.periods.get(callback.key)
+    declared = callback.timer_period_ns
+    if created is not None and declared is not None and not is_period(created, declared):
+        return Drift('rate', callback.key, None, declared, created, printable(
+            f'the timer of {callback.key} has a period of {format_duration(created)}, and '
+            f'{format_duration(declared)} is declared'))
     releases = observed.releases.get(callback.key, Releases())
     if releases.count == 1 and callback.kind == 'timer' and not callback.once and (
             observed.duration_ns > LEAST * period):

@@ -29,16 +29,23 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     """
     judge, who, table = recording.task_set, recording.who, recording.executions
     vertices = judge.vertices
+    keys = declared_keys(who, recording.recorded_set)
+    periods = {key: each.period for each in who.made if each.kind == 'timer'
+               and each.period > 0 and (key := keys.get(each.number)) is not None}
     releases: dict[str, Releases] = {}
     released, since = recording.releases, (recording.start or 0) + skip
     for dag, chosen in zip(judge.dags, rows_by(released['dag'], len(judge.dags))):
         mine = released['release'][chosen]
         mine = mine[mine >= since]
+        key = dag.vertices[dag.source].callback.key
         if len(mine):
-            of = releases[dag.vertices[dag.source].callback.key] = Releases()
+            of = releases[key] = Releases()
             of.add(int(mine.min()))
             of.add(int(mine.max()))
             of.count = len(mine)
+            if not recording.declared and key in periods:   # skipped releases are no jobs there
+                skipped = np.rint(np.diff(np.sort(mine)) / periods[key]) - 1
+                of.count += int(skipped[skipped > 0].sum())
     # declared callbacks that were started, and other executions, a coroutine's once each
     vertex, start, end = (table[name].copy() for name in ('vertex', 'start', 'end'))
     declared = (vertex >= 0) & (start >= 0)
@@ -50,7 +57,6 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     counts, late_counts, late_got = (dict(zip(numbers.tolist(), np.bincount(
         callback_of[which], minlength=len(numbers)).tolist()))
         for which in (every & ~waits, every & ~waits & late, every & late))
-    keys = declared_keys(who, recording.recorded_set)
     for callback, vertex in zip(
             numbers.tolist(), recording.vertices_of_callbacks(declared).tolist()):
         if vertex >= 0:
@@ -86,4 +92,4 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         max(0, recording.end - recording.begin), releases,
         dict(got), dict(ran), came, publishes, set(who.names_of_nodes) or None,
         [each.entity for each in who.made
-         if each.entity is not None and each.number not in bound]))
+         if each.entity is not None and each.number not in bound], periods))

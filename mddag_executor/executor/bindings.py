@@ -53,6 +53,8 @@ class Bindings:
         self._published: dict[str, set[str]] = {c.key: set() for c in self.declared}
         self._received: dict[str, set[str]] = {c.key: set() for c in self.declared}
         self._undeclared: dict[binding.Entity, None] = {}
+        #: The keys of the declared callbacks that have had an entity.
+        self._found: set[str] = set()
         # of the warning: when the executor began to judge (monotonic s), and whether it is over
         self._begin: float | None = None
         self._has_checked = task_set is None
@@ -74,6 +76,7 @@ class Bindings:
             return
         engine = self._engine
         assert self._task_set is not None
+        self._found.add(callback.key)
         entity.declare(callback)
         link(entity, self._task_set, engine.tables)
         entity.awaiting = engine.awaiting.get(callback.key)
@@ -106,6 +109,12 @@ class Bindings:
         if self._task_set is None or process is None:
             return set()
         return {c.key for c in self.declared if self._task_set.process_of(c.node) != process}
+
+    def not_found(self) -> dict[str, str | None]:
+        """Return the declared callbacks that never had an entity, each with a question or None."""
+        others = self.undeclared()
+        return {each.key: binding.suggest_entity(each, others)
+                for each in self.declared if each.key not in self._found}
 
     def undeclared(self) -> list[binding.Entity]:
         """Return all undeclared timers, subscriptions and services, including removed ones."""

@@ -49,6 +49,8 @@ def statistics(
             'unknown': engine.attribution.unknown,
             'doubtful': engine.attribution.doubtful},
         'never_ran': never_ran,
+        'not_found': {key: question for key, question in registry.bindings.not_found().items()
+                      if key in never_ran},
         'unreported_misses': 0 if notifier is None else notifier.unreported,
         'trace': None if recorder is None else {
             'path': recorder.path, 'lost': recorder.writer.dropped,

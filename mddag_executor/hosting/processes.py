@@ -353,6 +353,8 @@ def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
                          for key in ('unknown', 'doubtful')},
         'never_ran': [c.key for c in task_set.callbacks
                       if not callbacks.get(c.key, {'ran': 0})['ran']],
+        'not_found': {key: question for part in parts
+                      for key, question in part['not_found'].items()},
         'measured': None,
         'exclusion': [each for part in parts for each in part['exclusion']],
         'drift': [each.result() for each in drift(task_set, _observed(task_set, results))]}

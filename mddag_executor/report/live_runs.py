@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +57,10 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
                 name: count for name, each in callbacks.items()
                 if (count := each['unattributed' if each['declared'] else 'ran'])})):
         if numbers:
-            yield f'{counted(sum(numbers.values()), one, many)}: ' + listed(
-                [f'{name} {n}' for name, n in numbers.items()])
+            names = [f'{name} {n}' for name, n in numbers.items()]
+            # without a declaration they are all that there is to see
+            yield f'{counted(sum(numbers.values()), one, many)}: ' + (
+                listed(names) if result['dags'] else printable(', '.join(names)))
     yield from guessed_lines(_numbers(callbacks, 'guessed'))
     for each in result.get('exclusion', ()):
         if each['waited_ns'] >= SHOWN_NS:
@@ -71,11 +73,9 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
         yield (f'{counted(len(deaf), "callback")} without messages, as a publisher has an '
                'incompatible QoS: '
                + listed([f'{name} ({policy})' for name, policy in deaf.items()]))
-    never = result['never_ran']
     drift = result.get('drift', ())
     yield from drift_lines(drift)
-    if never and not any(each['kind'] == 'never ran' for each in drift):
-        yield f'{counted(len(never), "declared callback")} never ran: ' + listed(never)
+    yield from _never_ran(result, {each['callback'] for each in drift})
     for trace in (result['trace'], *(p['trace'] for p in result.get('processes', ()))):
         if trace is not None:
             lost = trace['lost']
@@ -90,6 +90,23 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
         if process['died']:
             yield printable(f'process {process["name"]} {process["how"]}: '
                             f'{process["said"] or "it said nothing"}')
+
+
+def _never_ran(result: dict[str, Any], reported: Collection[str]) -> Iterator[str]:
+    """Yield lines about the declared callbacks that never ran, without the reported ones."""
+    not_found = {key: question for key, question in result['not_found'].items()
+                 if key not in reported}
+    if not_found:
+        found = counted(
+            len(not_found), 'declared callback was', 'declared callbacks were')
+        yield f'{found} found in no node: ' + listed(
+            [key if question is None else f'{key} ({question})'
+             for key, question in not_found.items()])
+    never = [key for key in result['never_ran']
+             if key not in reported and key not in result['not_found']]
+    if never:
+        yield (f'{counted(len(never), "declared callback")} never ran, as nothing started '
+               f'{"it" if len(never) == 1 else "them"}: ' + listed(never))
 
 
 def _absent(dags: dict[str, Any]) -> Iterator[str]:

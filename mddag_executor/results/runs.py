@@ -130,7 +130,9 @@ class ExecutorState(TypedDict):
     unattributed: Unattributed
     """Messages of declared callbacks that ran without a job."""
     never_ran: list[str]
-    """Declared callbacks that have not run although they were due."""
+    """Declared callbacks that have not run."""
+    not_found: dict[str, str | None]
+    """Those of them that no node has, each with a question about its name, or null."""
 
 
 class Statistics(ExecutorState):

@@ -263,6 +263,25 @@ def test_a_wrong_name_is_warned_of_once(
     else:
         line, = warned
         assert f'camera.yaml: {expected}' in line
+    # the last lines repeat it, and tell it from what nothing has started
+    lines = list(live_lines({**executor.statistics(), 'measured': None}))
+    never = [line for line in lines if 'never ran' in line or 'found in no node' in line]
+    assert never == ([] if expected is None else [expected.partition(';')[0]])
+    never_started = {'never_ran': ['/detector:detect'], 'not_found': {}, 'measured': None}
+    assert ('1 declared callback never ran, as nothing started it: /detector:detect'
+            in live_lines({**executor.statistics(), **never_started}))
+
+
+def test_all_callbacks_of_a_run_without_a_declaration_are_listed(make_executor, make_node):
+    node, ran = make_node('many'), []
+    for _ in range(14):
+        node.create_timer(0.01, lambda: ran.append(1))
+    executor = make_executor(nodes=[node])
+    executor.spin_until_future_complete(Future(), 0.3)
+    line, = (line for line in live_lines({**executor.statistics(), 'measured': None})
+             if 'runs of undeclared callbacks' in line)
+    assert ran and 'more' not in line
+    assert line.count('/many') == len(executor.statistics()['callbacks'])
 
 
 def test_a_subscription_that_gets_nothing_for_its_qos_is_named(make_executor, make_node):

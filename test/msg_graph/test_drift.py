@@ -53,7 +53,7 @@ def never_ran(*names):
     return {'ran': dict.fromkeys(names, 0), 'got': dict.fromkeys(names, 0)}
 
 
-NO_E = "/b:e never ran in 0.500 s: did you mean the topic '/zz'?"
+NO_E = "/b:e never ran in the 0.500 s after the first release: did you mean the topic '/zz'?"
 SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
 
 
@@ -61,6 +61,9 @@ SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
     ({'publishes': {'/b:w': {'/q\x1b', '/p', '/parameter_events'}}},
      ['/b:w publishes /p, which it does not declare',
       '/b:w publishes /q\\x1b, which it does not declare']),
+    ({'periods': {'/a:t': 10 * MS}}, []), ({'periods': {'/a:t': 10_010_000}}, []),
+    ({'periods': {'/a:t': 11 * MS}},
+     ['the timer of /a:t has a period of 11ms, and 10ms is declared']),
     (released(0.81), []), (released(1.19), []),
     (released(0.79), ['/a:t was released every 7.9ms, and 10ms is declared']),
     (released(1.21), ['/a:t was released every 12.1ms, and 10ms is declared']),
@@ -71,7 +74,7 @@ SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
             if got < 50 else '')])
       for got in (38, 62)),
     # Of consecutive callbacks the first that never ran is the reason.
-    (never_ran('/b:m', '/b:s', '/b:e'), ['/b:m never ran in 0.500 s']),
+    (never_ran('/b:m', '/b:s', '/b:e'), ['/b:m never ran in the 0.500 s after the first release']),
     (never_ran('/b:s', '/b:e'), [NO_E.replace('e', 's', 1), NO_E]),
     # What an overload skips and drops is no difference.
     ({'ran': SKIPPED | {'/b:m': 1}, 'got': {'/b:m': 20, '/b:e': 0}}, []),
@@ -79,7 +82,8 @@ SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
     ({'ran': SKIPPED, 'got': {'/b:m': 20, '/b:e': 15}}, []),
     ({'came': {'/b:s': {'/x', '/z'}}}, []),
     ({'came': {'/b:s': {'/x'}}},
-     ["/b:s never got a message of /z in 0.500 s: did you mean the topic '/zz'?"]),
+     ["/b:s never got a message of /z in the 0.500 s after the first release: did you mean the "
+      "topic '/zz'?"]),
 ])
 def test_each_difference(changes, texts):
     seen = observed()
