@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import os
 from types import TracebackType
+from typing import Any
 
 _OWN_FOLDER = os.path.dirname(os.path.abspath(__file__)) + os.sep
 
@@ -60,9 +61,12 @@ class UserCodeError(MddagError):
 
     The command line shows the traceback of the cause and exits with status 70: the line alone,
     and the status of bad input, would take the node's `FileNotFoundError` for one of this program.
+
+    :ivar result: of the run, if ``hosting.run`` raises it.
     """
 
     status = 70
+    result: Any = None
 
 
 class UsageError(MddagError):

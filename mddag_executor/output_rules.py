@@ -49,6 +49,31 @@ def check_replaced(path: str, *, is_kept: bool, overwrite: bool = False) -> None
             raise InputError(path, f'this file is a {what}', 'name another file for the result')
 
 
+def check_output(path: str | None, is_kept: bool = False, overwrite: bool = False) -> None:
+    """
+    Check that a file can be written: `-` always.
+
+    :param is_kept: whether it is a recording or a declaration, which may need `overwrite`.
+    """
+    if path is None or path == '-':
+        return
+    if os.path.isdir(path):
+        raise InputError(path, 'this is a directory', 'name a file')
+    if not is_special(path):
+        check_parent(path)
+        check_replaced(path, is_kept=is_kept, overwrite=overwrite)
+
+
+def check_parent(path: str) -> None:
+    """Raise InputError if there is no folder for an output that can be written to."""
+    # not by Path.resolve, which raises if links lead in a circle
+    folder = os.path.dirname(os.path.realpath(path))
+    if not os.path.isdir(folder):
+        raise InputError(path, f'there is no directory {Path(path).parent}', 'make it first')
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(path, 'the directory cannot be written to', 'name another one')
+
+
 def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
     """Open a new recording for writing, unbuffered, or raise FileExistsError (rule 1)."""
     try:

@@ -23,10 +23,10 @@ from mddag_executor.cli.text import is_quiet, warn
 from mddag_executor.errors import InputError, UsageError
 from mddag_executor.output_rules import (
     check_distinct,
-    check_replaced,
+    check_output,
+    check_parent,
     check_results,
     is_declaration,
-    is_special,
     remove_results,
     whole_file,
 )
@@ -171,21 +171,6 @@ def _files(args: argparse.Namespace) -> Iterator[tuple[str, Input | Output]]:
                 yield name.replace('_', ' '), each
 
 
-def check_output(path: str | None, is_kept: bool = False, overwrite: bool = False) -> None:
-    """
-    Check that a file can be written: `-` always.
-
-    :param is_kept: whether it is a recording or a declaration, which may need `overwrite`.
-    """
-    if path is None or path == '-':
-        return
-    if os.path.isdir(path):
-        raise InputError(path, 'this is a directory', 'name a file')
-    if not is_special(path):
-        _check_parent(path)
-        check_replaced(path, is_kept=is_kept, overwrite=overwrite)
-
-
 def _check_report(path: Report) -> None:
     # `replay run.mcap --report graph.yaml` must not replace a declaration.
     if os.path.splitext(path)[1].lower() not in ('', '.html', '.htm'):
@@ -207,16 +192,7 @@ def output_file(path: str) -> Iterator[BinaryIO]:
 def check_folder(path: str, names: Collection[str]) -> None:
     """Find out whether a folder of results with files of these names can be written."""
     check_results(Path(path), names)
-    _check_parent(path)
-
-
-def _check_parent(path: str) -> None:
-    # not by Path.resolve, which raises if links lead in a circle
-    folder = os.path.dirname(os.path.realpath(path))
-    if not os.path.isdir(folder):
-        raise InputError(path, f'there is no directory {Path(path).parent}', 'make it first')
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(path, 'the directory cannot be written to', 'name another one')
+    check_parent(path)
 
 
 @contextmanager
@@ -291,5 +267,9 @@ def show(
 
 def wants_tables(args: argparse.Namespace) -> bool:
     """Return whether standard output is for people, and not taken by a result."""
-    return not is_quiet() and not any(
-        isinstance(each, Output) and each == '-' for _, each in _files(args))
+    return not is_quiet() and not is_output_taken(args)
+
+
+def is_output_taken(args: argparse.Namespace) -> bool:
+    """Return whether a result takes standard output."""
+    return any(isinstance(each, Output) and each == '-' for _, each in _files(args))

@@ -17,6 +17,7 @@ from pathlib import PurePath
 from mddag_executor.cli import common, options, recorded
 from mddag_executor.cli.text import printable, say, warn
 from mddag_executor.errors import UsageError
+from mddag_executor.output_rules import check_output
 
 EXAMPLE = """\
 mddag export run.mcap -o run.pftrace
@@ -50,7 +51,7 @@ def main(args: argparse.Namespace) -> int:
     if form == _TABLES:
         common.check_folder(args.output, table_files())
     else:
-        common.check_output(args.output)
+        check_output(args.output)
     source = recorded.source_of(args)
     if args.rows == 'jobs' and source.task_set is None:
         source.check_deadlines()

@@ -17,6 +17,7 @@ from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.generate import Options
+from mddag_executor.output_rules import check_output
 
 EXAMPLE = """\
 mddag generate --utilisation 0.6 --seed 7 -o random.yaml
@@ -79,7 +80,7 @@ def main(args: argparse.Namespace) -> int:
     for each in (every[0], every[-1]):
         each.check()
     if args.sets is None:
-        common.check_output(args.output, is_kept=True, overwrite=args.overwrite)
+        check_output(args.output, is_kept=True, overwrite=args.overwrite)
         common.write_text(args.output, generate(every[0]))
         return 0
     if args.output == '-':

@@ -125,6 +125,7 @@ class Host:
         context = self.context = rclpy.utilities.get_default_context()
         replace = self._replacements.replace
         self._replacements.callback(_return_to, os.getcwd())
+        self._replacements.callback(setattr, sys, 'argv', sys.argv)
         for name, function in (('init', self._init), ('ok', self._ok),
                                ('shutdown', self._shutdown), ('try_shutdown', self._shutdown)):
             setattr(context, name, function)
@@ -153,7 +154,7 @@ class Host:
 
     # --- programs --------------------------------------------------------------------------------
 
-    def load(self, specs: Iterable[str], ros_arguments: Iterable[str] = ()) -> list[Program]:
+    def load(self, specs: Iterable[Any], ros_arguments: Iterable[str] = ()) -> list[Program]:
         """Find programs; their modules are imported under the host's replacements as well."""
         self._loading = True
         try:
@@ -162,14 +163,16 @@ class Host:
             self._loading = False
 
     def run(
-        self, supervise: Callable[[], Result], leave: Callable[[Callable[[], Result]], NoReturn]
+        self, supervise: Callable[[], Result],
+        leave: Callable[[Callable[[], Result]], NoReturn] | None = None,
     ) -> Result:
         """
         Call a function in a thread of its own, and run in this thread the program that it starts.
 
         :param supervise: calls ``start``; it returns when the run has ended.
         :param leave: is called by that thread, after the end, if the program keeps this thread;
-            gets what returns the result of ``supervise`` or raises its exception.
+            gets what returns the result of ``supervise`` or raises its exception.  None: this
+            method waits for the program.
         :return: the result of ``supervise``.
         """
         outcome: Callable[[], Result]
@@ -183,10 +186,14 @@ class Host:
             if self.end():
                 self.interrupt()
             self._of_main.put(None)
-            if self.guests and not self.guests[0].done.is_set() and self._has_main(self.guests[0]):
+            if leave is not None and self.guests and self._has_main(self.guests[0]) and (
+                    not self.guests[0].done.is_set()):
                 leave(outcome)
 
-        self._main = threading.current_thread()
+        if threading.current_thread() is threading.main_thread():
+            self._main = threading.main_thread()
+        else:  # each program gets a thread of its own
+            self._of_main.put(None)
         supervisor = threading.Thread(target=body, name='mddag-run', daemon=True)
         supervisor.start()
         guest = self._of_main.get()

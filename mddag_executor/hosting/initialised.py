@@ -29,8 +29,12 @@ def initialised(
 
     rclpy's signal handlers are not installed: they would take Ctrl-C from the summary.
 
-    :raises UsageError: when rclpy refuses the arguments, or cannot make its log directory.
+    :raises UsageError: when rclpy refuses the arguments, cannot make its log directory, or is
+        initialised already.
     """
+    if (context or get_default_context()).ok():
+        raise UsageError('rclpy is initialised already in this process: call rclpy.shutdown() '
+                         'before the run')
     try:
         _init(context, ros_arguments(ros_args))
     except Exception as error:

@@ -29,7 +29,7 @@ import shlex
 import sys
 import traceback
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 from ament_index_python.packages import (
     get_package_prefix,
@@ -37,6 +37,7 @@ from ament_index_python.packages import (
     PackageNotFoundError,
 )
 from mddag_executor.errors import MddagError, UserCodeError
+from mddag_executor.hosting.run_options import spec_of
 from msg_graph.errors import did_you_mean
 from rclpy.node import Node
 
@@ -76,14 +77,21 @@ class MainFailed(UserCodeError):
     status = 1
 
 
-def resolve(text: str, ros_arguments: Iterable[str] = ()) -> Program:
+def resolve(
+    text: str | Callable[[], Any], ros_arguments: Iterable[str] = ()
+) -> Program:
     """
     Find the program of a SPEC; its arguments may follow, as in a shell.
+
+    A function or class is such a program itself.
 
     Imported modules see the command line that the program will see.
 
     :raises LoadingError: when it cannot be found or imported, or does not make nodes.
     """
+    if not isinstance(text, str):
+        spec = spec_of(text)
+        return Program(spec, spec.partition(':')[0], _checked(spec, spec, text))
     try:
         spec, *arguments = shlex.split(text) or ['']
     except ValueError as error:
@@ -127,6 +135,10 @@ def _attribute(spec: str, module_name: str, attribute: str) -> Program:
             spec, f"module '{module_name}' has no '{attribute}'", _suggest(attribute, [
                 name for name, value in vars(module).items()
                 if not name.startswith('_') and callable(value)]))
+    return Program(spec, module_name, _checked(spec, attribute, target))
+
+
+def _checked(spec: str, attribute: str, target: Any) -> Callable[[], Any]:
     if not callable(target) or isinstance(target, type) and not issubclass(target, Node):
         raise LoadingError(
             spec, f"'{attribute}' makes no node",
@@ -139,7 +151,7 @@ def _attribute(spec: str, module_name: str, attribute: str) -> Program:
             raise LoadingError(
                 spec, f"'{attribute}' cannot be called without arguments ({error})",
                 'name a function or class that needs none') from None
-    return Program(spec, module_name, target)
+    return cast('Callable[[], Any]', target)
 
 
 def _import(spec: str, module_name: str) -> ModuleType:

@@ -54,12 +54,15 @@ class Signals:
     A SIGINT that comes while a run ends, but not together with the first, interrupts what still
     runs; the next one interrupts the end itself.
 
+    :param ends_process: the process ends with the run, so signals that come after the first one do
+        nothing at the end.
     :ivar ends_run: whether SIGINT, or a signal that a program handles, ends the run.
     :ivar wake: called after each signal, without a lock.
     :ivar ended_by: the signal that has ended the run; None: none has.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ends_process: bool = False) -> None:
+        self._ends_process = ends_process
         self.ends_run: Callable[[int], bool] = lambda number: True
         self.wake: Callable[[], None] = lambda: None
         self.ended_by: int | None = None
@@ -92,7 +95,7 @@ class Signals:
     def __exit__(self, *args: object) -> None:
         for number, before in self._before.items():
             signal.signal(number, before)
-        for number in self._before if self._last is not None else ():
+        for number in self._before if self._ends_process and self._last is not None else ():
             # The process is about to end by itself; it is not to look as if it was killed.
             signal.signal(number, signal.SIG_IGN)
 

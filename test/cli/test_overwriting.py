@@ -14,6 +14,7 @@ import stat
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.cli import common
 from mddag_executor.errors import InputError, MddagError
+from mddag_executor.output_rules import check_output
 from mddag_executor.rerun import rerun
 from mddag_executor.trace import TraceFile, TraceWriter
 import pytest
@@ -92,7 +93,7 @@ def test_an_output_may_be_a_pipe(tmp_path):
     pipe = tmp_path / 'pipe'
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    common.check_output(str(pipe))
+    check_output(str(pipe))
     common.write_text(str(pipe), 'through')
     assert os.read(reader, 100) == b'through'
     os.close(reader)
@@ -103,4 +104,4 @@ def test_an_output_may_be_a_pipe(tmp_path):
 def test_a_folder_without_write_permission(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(InputError, match='cannot be written to'):
-        common.check_output(str(tmp_path / 'new.json'))
+        check_output(str(tmp_path / 'new.json'))

@@ -390,7 +390,8 @@ def test_a_node_may_remove_the_folder_in_which_the_run_began(folder, mddag):
 
 def test_an_end_that_takes_too_long_shows_the_stack_of_each_thread(folder):
     robot(3)
-    code = ('import sys; from mddag_executor.cli import main, run; run.STUCK_S = 0.5\n'
+    code = ('import sys; from mddag_executor.cli import main; '
+            'from mddag_executor.hosting import run_here; run_here.STUCK_S = 0.5\n'
             'sys.exit(main.main(sys.argv[1:]))')
     _, err = run_program(code, 'run', *NODES, '--duration', '500ms')
     assert (err.count('Timeout'), err.count(' in track')) == (1, 1)

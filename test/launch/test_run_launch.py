@@ -6,12 +6,14 @@ The options of `mddag run` reach its launch file and its child processes.
 launch is not on the package index: `test_colcon.py` runs the file where it is installed.
 """
 
-import argparse
+from dataclasses import dataclass
 
 from mddag_executor.cli import launch_arguments, run
 from mddag_executor.cli import main as program
 from mddag_executor.errors import UsageError
 from mddag_executor.hosting.processes import Part
+from mddag_executor.hosting.run_options import option, RunOptions
+from mddag_executor.hosting.run_result import RunResult
 import pytest
 
 
@@ -53,30 +55,30 @@ def test_every_argument_is_an_option_that_mddag_run_has():
 
 
 def test_a_new_option_needs_one_line(monkeypatch, tmp_path):
-    before = run.add_arguments
+    @dataclass(frozen=True)
+    class WithMore(RunOptions):
+        limit: str | None = option(None, 'in metres')
+        loud: bool = option(False, 'say more', kind='switch')
+        only: list[str] = option((), 'a name', kind='several')
 
-    def with_another(parser: argparse.ArgumentParser) -> None:
-        before(parser)
-        parser.add_argument('--limit', type=float, help='in metres')
-        parser.add_argument('--loud', action='store_true', help='say more')
-        parser.add_argument('--only', action='append', default=[], help='a name')
-
-    monkeypatch.setattr(run, 'add_arguments', with_another)
+    monkeypatch.setattr(run, 'RunOptions', WithMore)
     assert launch_arguments.arguments().items() >= {
         'limit': 'in metres', 'loud': 'true: say more'}.items()
     args = parsed(command(
-        graph='graph.yaml', synthetic='sleep', limit='0.5', loud='true', only='a b'))
-    assert (args.limit, args.loud, args.only) == (0.5, True, ['a', 'b'])
+        graph='graph.yaml', synthetic='sleep', limit='0.5', loud='true', only="'a b' c"))
+    given = run.options_of(args)
+    assert (given.limit, given.loud, given.only) == ('0.5', True, ['a b', 'c'])
 
     # a child process: its options come from the folder of the run
     seen = []
-    monkeypatch.setattr(run, 'run_here', lambda args, *_: seen.append(args) or 0)
+    monkeypatch.setattr('mddag_executor.hosting.run_here.run_here',
+                        lambda options, *_: seen.append(options) or RunResult({}))
     monkeypatch.setattr('mddag_executor.hosting.processes.belong_to_parent', lambda pid: None)
     monkeypatch.setattr('os._exit', lambda status: None)
     text = 'mddag: 1\nnodes:\n  - {node: /n, callbacks: [{name: t, timer: 9ms, deadline: 9ms}]}'
-    Part.make(str(tmp_path), text, run.passed_on(args))
+    Part.make(str(tmp_path), text, given.passed_on())
     child = parsed(['run', 'graph.yaml', '--part', str(tmp_path), '--synthetic', 'sleep',
                     '--process', 'one'])
     run.main(child)
     assert [(each.limit, each.loud, each.only, each.process) for each in seen] == [
-        (0.5, True, ['a', 'b'], 'one')]
+        ('0.5', True, ['a b', 'c'], 'one')]

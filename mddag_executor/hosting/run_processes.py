@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-`mddag run` over several processes: the process of each node, and their run as one.
+A run in several processes: the process of each node, and their run as one.
 
 The nodes of a program are known only when it runs. So each `--node` is started once before the
 run, in a process that ends when the nodes are made, unless its process is given: `PROCESS=SPEC`.
@@ -9,8 +9,7 @@ run, in a process that ends when the nodes are made, unless its process is given
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import os
 from pathlib import Path
 import subprocess
@@ -20,164 +19,146 @@ import time
 from typing import Any
 
 from mddag_executor import defaults
-from mddag_executor.cli import common, verdicts
-from mddag_executor.cli.main import EXIT_DEFECT
-from mddag_executor.cli.run import incomplete, not_found, passed_on, warn_of
-from mddag_executor.cli.text import warn
 from mddag_executor.errors import UsageError
+from mddag_executor.executor import other_processes, path_watch
+from mddag_executor.hosting.processes import (
+    combine_results,
+    Part,
+    ProcessError,
+    read_result,
+    Run,
+    Supervisor,
+)
+from mddag_executor.hosting.run_here import Display, plan_of, warn_of
+from mddag_executor.hosting.run_options import RunOptions, spec_of
+from mddag_executor.hosting.run_result import RunResult
 from mddag_executor.hosting.signals import Signals
-from mddag_executor.output_rules import remove_recording
-from mddag_executor.report.live_runs import live_lines
+from mddag_executor.laboratory.placement import packed
+from mddag_executor.output_rules import check_output, remove_recording
+from mddag_executor.simulate.workload import draw_execution_times
+from mddag_executor.synthetic.measure import ExecutionPlan
 from msg_graph import TaskSet
-from msg_graph.edit import load_processes, with_processes
+from msg_graph.edit import with_processes
 from msg_graph.errors import did_you_mean, listed, quoted
 
 _PROBE_TIMEOUT_S = 120.0
 
 
-def with_declared(args: argparse.Namespace, task_set: TaskSet) -> TaskSet:
-    """Return the task set with the processes of `--processes FILE`, else of the declaration."""
-    if args.processes is None:
-        return task_set
-    if args.processes.isdecimal():
-        raise UsageError(f'--process {args.process}: with --processes {args.processes} no process '
-                         'has a name of its own: name a file')
-    name, text = common.read_text(args.processes)
-    return with_processes(task_set, load_processes(text, name, task_set))
+def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> RunResult:
+    """Run nodes in several processes until the run ends; return what came of it."""
+    for spec in options.nodes:
+        if not isinstance(spec, str):
+            raise UsageError(f"--node {spec!r}: several processes need its name: give "
+                             f"'{spec_of(spec)}', if it can be imported from there")
+    warnings: list[str] = []
 
+    def warn(line: str) -> None:
+        warnings.append(line)
+        display.warn(line)
 
-def run_processes(args: argparse.Namespace, task_set: TaskSet) -> int:
-    """Run nodes in several processes until the run ends, and print what came of the deadlines."""
-    from mddag_executor.hosting.processes import (
-        combine_results,
-        Part,
-        ProcessError,
-        read_result,
-        Run,
-        Supervisor,
-    )
-    from mddag_executor.synthetic.measure import ExecutionPlan
-    plan = None
-    if args.synthetic is not None:
-        workers = defaults.workers(args.workers, task_set)
-        plan = ExecutionPlan(task_set, args.seed, args.utilisation, workers, args.synthetic)
-    with tempfile.TemporaryDirectory(prefix='mddag-') as folder, Signals() as signals:
-        common_options = passed_on(args)
-        Part.make(folder, task_set.text, common_options)
-        task_set, specs = _placed(args, task_set, plan, folder)
-        Part.make(folder, task_set.text, common_options)
+    plan = plan_of(options, task_set)
+    with tempfile.TemporaryDirectory(prefix='mddag-') as folder, Signals(
+            ends_process=display.leave is not None) as signals:
+        passed_on = options.passed_on()
+        Part.make(folder, task_set.text, passed_on)
+        task_set, specs = _placed(options, task_set, plan, folder)
+        Part.make(folder, task_set.text, passed_on)
         names = [process.name for process in task_set.processes]
-        _warn_of_contested(task_set)
-        _warn_of_divided_paths(task_set)
+        _warn_of_contested(task_set, warn)
+        _warn_of_divided_paths(task_set, warn)
         for name in names:
-            common.check_output(
-                _trace(args.trace, name), is_kept=True, overwrite=args.overwrite)
+            check_output(_trace(options.trace, name), is_kept=True, overwrite=options.overwrite)
         if plan is not None:
-            warn_of(plan, len(names))
+            warn_of(plan, warn, len(names))
 
         def command(name: str) -> list[str]:
-            trace = _trace(args.trace, name)
-            return [*_command(args, folder, specs[name]), '--process', name,
+            trace = _trace(options.trace, name)
+            return [*_command(options, folder, specs[name], display.is_quiet), '--process', name,
                     *(() if trace is None else ('--trace', trace))]
-
-        out = sys.stdout if common.wants_tables(args) else sys.stderr
 
         def ended(run: Run) -> None:
             Part.note_end(folder, run.name)
             if run.died:
                 warn(f'process {run.name} {run.how}: {run.said or "it said nothing"}')
 
-        supervisor = Supervisor(command, args.on_exit == 'continue', out, sys.stderr, ended)
+        supervisor = Supervisor(command, options.on_exit == 'continue',
+                                display.output or sys.stdout, sys.stderr, ended)
         signals.end_of(supervisor)
         began = time.time()
         try:
-            supervisor.run(names, None if args.duration is None else args.duration / 1e9)
+            supervisor.run(names, options.seconds)
         except ProcessError:
-            traces = [] if Part.has_begun(folder) else [_trace(args.trace, n) for n in names]
+            traces = [] if Part.has_begun(folder) else [_trace(options.trace, n) for n in names]
             for trace in traces:    # not those of an earlier run
                 if trace is not None and Path(trace).exists() and os.stat(trace).st_mtime > began:
                     remove_recording(trace)
             raise
         parts = [read_result(folder, run.process.pid) for run in supervisor.runs]
     results = {run.name: each for run, each in zip(supervisor.runs, parts) if each is not None}
-    result = {
-        'file': task_set.file, 'nodes': args.node, 'synthetic': args.synthetic,
-        'policy': args.policy, 'on_late': args.on_late,
-        'workers': defaults.workers(args.workers, task_set),
+    return RunResult({
+        'file': task_set.file, 'nodes': options.specs, 'synthetic': options.synthetic,
+        'policy': options.policy, 'on_late': options.on_late,
+        'workers': defaults.workers(options.workers, task_set),
         **combine_results(task_set, results), 'trace': None,
         'processes': [{
             'name': run.name, 'nodes': next(
                 p.nodes for p in task_set.processes if p.name == run.name),
             'pid': run.process.pid, 'status': run.status, 'died': run.died, 'how': run.how,
             'said': run.said if run.died else None,
-            'trace': _trace_of_dead(_trace(args.trace, run.name)) if part is None
+            'trace': _trace_of_dead(_trace(options.trace, run.name)) if part is None
             else part['trace']}
-            for run, part in zip(supervisor.runs, parts)]}
-    common.show(args, result, live_lines(result))
-    if any(run.died for run in supervisor.runs):
-        return EXIT_DEFECT
-    status = verdicts.exit_status(args, result, task_set.file)
-    if error := incomplete(*(part['trace'] for part in parts if part is not None)) or not_found(
-            args, result):
-        raise error
-    return status
+            for run, part in zip(supervisor.runs, parts)]}, warnings=tuple(warnings))
 
 
-def _warn_of_divided_paths(task_set: TaskSet) -> None:
-    from mddag_executor.executor.path_watch import divided
-    for name in divided(task_set):
+def _warn_of_divided_paths(task_set: TaskSet, warn: Callable[[str], None]) -> None:
+    for name in path_watch.divided(task_set):
         warn(f'path {name}: its callbacks run in several processes, so this run leaves it out: '
              'record it with --trace, and judge it with mddag replay')
 
 
-def _warn_of_contested(task_set: TaskSet) -> None:
-    from mddag_executor.executor.other_processes import contested, divided
-    dags = divided(task_set)
+def _warn_of_contested(task_set: TaskSet, warn: Callable[[str], None]) -> None:
+    dags = other_processes.divided(task_set)
     topics = {t for v in task_set.vertices if v.dag in dags for t in v.callback.publishes}
-    for topic in sorted(contested(task_set) & topics):
+    for topic in sorted(other_processes.contested(task_set) & topics):
         warn(f'{topic}: nodes of several processes publish it, so the job of a message is '
              'unknown: put these nodes into one process')
 
 
 def _placed(
-    args: argparse.Namespace, task_set: TaskSet, plan: Any, folder: str
+    options: RunOptions, task_set: TaskSet, plan: ExecutionPlan | None, folder: str
 ) -> tuple[TaskSet, dict[str, list[str]]]:
     """Return the task set with its processes, and the SPECs of each process."""
-    number = args.processes if args.processes and args.processes.isdecimal() else None
-    if number is None:
-        task_set = with_declared(args, task_set)
+    number = options.n_processes
     names = {process.name for process in task_set.processes} if number is None else set()
     said: dict[str, str] = {}  # where a SPEC is to run, as it says itself
-    for spec in args.node:
+    for spec in options.specs:
         name, equals, _ = spec.partition('=')
         if equals and name in names:
             said[spec] = name
         elif equals and not {*'/: '} & {*name}:
             raise UsageError(f'--node {spec}: there is no process {quoted(name)}: '
                              + did_you_mean(name, names, 'name one of the declaration'))
-    unsaid = [spec for spec in args.node if spec not in said]
-    nodes = _probe(args, folder, unsaid) if unsaid else {}
+    unsaid = [spec for spec in options.specs if spec not in said]
+    nodes = _probe(options, folder, unsaid) if unsaid else {}
     if number is not None:
-        task_set = _place(args, task_set, int(number), plan, list(nodes.values()))
+        task_set = _place(options, task_set, number, plan, list(nodes.values()))
     specs: dict[str, list[str]] = {process.name: [] for process in task_set.processes}
-    for spec in args.node:
+    for spec in options.specs:
         name = said.get(spec) or _process_of(task_set, spec, nodes[spec])
         specs[name].append(spec.removeprefix(f'{name}=') if spec in said else spec)
     for process in task_set.processes:
-        if args.node and not specs[process.name]:
+        if options.nodes and not specs[process.name]:
             raise UsageError(f'process {quoted(process.name)}: no --node brings one of its nodes '
                              f'({listed(process.nodes)}): give it, or remove the process')
     return task_set, specs
 
 
 def _place(
-    args: argparse.Namespace, task_set: TaskSet, n: int, plan: Any,
+    options: RunOptions, task_set: TaskSet, n: int, plan: ExecutionPlan | None,
     together: Sequence[Sequence[str]],
 ) -> TaskSet:
     """Place the nodes in N processes; what one program brings stays together."""
-    from mddag_executor.laboratory.placement import packed
-    from mddag_executor.simulate.workload import draw_execution_times
-    times = draw_execution_times(task_set, args.seed, undeclared=0) if plan is None else [
+    times = draw_execution_times(task_set, options.seed, undeclared=0) if plan is None else [
         [plan.execution_ns(v) for v in dag.vertices] for dag in task_set.dags]
     declared = {callback.node for callback in task_set.callbacks}
     return with_processes(task_set, packed(task_set, n, times, [
@@ -197,14 +178,13 @@ def _process_of(task_set: TaskSet, spec: str, nodes: Sequence[str]) -> str:
 
 
 def _probe(
-    args: argparse.Namespace, folder: str, specs: Sequence[str]
+    options: RunOptions, folder: str, specs: Sequence[str]
 ) -> Mapping[str, Sequence[str]]:
     """Return the names of the nodes that each SPEC brings."""
-    from mddag_executor.hosting.processes import ProcessError, read_result
     # These nodes must not be discovered.
     environment = {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
     with subprocess.Popen(
-        _command(args, folder, specs), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        _command(options, folder, specs), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT, text=True, errors='replace', env=environment,
     ) as process:
         try:
@@ -222,14 +202,17 @@ def _probe(
     return dict(zip(specs, names))
 
 
-def _command(args: argparse.Namespace, folder: str, specs: Sequence[str]) -> list[str]:
+def _command(
+    options: RunOptions, folder: str, specs: Sequence[str], is_quiet: bool = False
+) -> list[str]:
     """Return the command line of a part, up to its name; its options are in the folder."""
     nodes = [word for spec in specs for word in ('--node', spec)]
-    return [sys.executable, '-m', 'mddag_executor', 'run', args.graph, '--part', folder,
-            *(nodes if args.synthetic is None else ('--synthetic', args.synthetic))]
+    return [sys.executable, '-m', 'mddag_executor', 'run', options.graph_name, '--part', folder,
+            *(() if not is_quiet else ('--quiet',)),
+            *(nodes if options.synthetic is None else ('--synthetic', options.synthetic))]
 
 
-def _trace(given: str | None, name: str) -> str | None:
+def _trace(given: str | os.PathLike[str] | None, name: str) -> str | None:
     if given is None:
         return None
     path = Path(given)

@@ -1,0 +1,175 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""``hosting.run``: what tests and notebooks call instead of `mddag run`."""
+
+import gc
+import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import threading
+
+from mddag_executor.errors import MddagError, UsageError, UserCodeError
+from mddag_executor.hosting import run, RunOptions, RunResult, RunWarning
+from mddag_executor.trace import read_events
+import msg_graph
+from msg_graph import GraphError
+import pytest
+import rclpy
+from rclpy.node import Node
+
+GRAPH = """\
+mddag: 1
+nodes:
+  - {node: /api, callbacks: [{name: tick, timer: 20ms, deadline: 20ms, execution_time: 1ms}]}
+"""
+
+
+class Api(Node):
+    """A node without surprises."""
+
+    def __init__(self):
+        super().__init__('api')
+        self.create_timer(0.02, self.tick)
+
+    def tick(self):
+        pass
+
+
+class Broken(Api):
+    """A node whose callback raises."""
+
+    def tick(self):
+        raise FileNotFoundError(2, 'No such file', '/calibration.yaml')
+
+
+def returns_three():
+    rclpy.init()
+    rclpy.spin_once(Api(), timeout_sec=0.1)
+    rclpy.shutdown()
+    return 3
+
+
+def wrong():
+    raise ValueError('no licence')
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch, no_thread_leak):
+    monkeypatch.chdir(tmp_path)
+    Path('graph.yaml').write_text(GRAPH)
+    return tmp_path
+
+
+def test_nodes_run_twice_in_one_process_and_leave_everything_as_it_was(here):
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    argv = [*sys.argv]
+    for number in range(2):
+        result = run(RunOptions(
+            nodes=[Api], graph=msg_graph.load('graph.yaml'), duration='300ms', diagnostics=None,
+            trace=f'{number}.mcap'))
+        assert isinstance(result, RunResult)
+        assert result.dags['/api']['sinks']['/api:tick']['completed'] > 0
+        assert result.callbacks['/api:tick']['ran'] > 0
+        assert (result.status, result.error, result.warnings) == (0, None, ())
+        assert result.in_time == (not result.to_json()['deadline_missed'])
+        found = json.loads(json.dumps(result.to_json()))
+        assert found['nodes'] == [f'{__name__}:Api'] and found['file'] == 'graph.yaml'
+        assert [*read_events(f'{number}.mcap')]
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    assert sys.argv == argv and not rclpy.ok() and gc.get_freeze_count() == 0
+
+
+def test_it_runs_in_a_thread_and_nodes_made_from_a_declaration(here):
+    done = []
+    thread = threading.Thread(target=lambda: done.append(run(RunOptions(
+        nodes=[returns_three], diagnostics=None))))
+    thread.start()
+    thread.join()
+    result, = done
+    assert result.status == 3
+    assert [(each.spec, each.status) for each in result.programs] == [
+        (f'{__name__}:returns_three', 3)]
+    with pytest.warns(RunWarning, match='no scheduler can keep its deadline of 20.0 ms'):
+        result = run(RunOptions(
+            synthetic='sleep', graph=msg_graph.loads(GRAPH.replace('1ms', '30ms'), name='g'),
+            duration='200ms'))
+    assert not result.in_time and len(result.warnings) == 1
+    assert result.to_json()['measured']['mode'] == 'sleep'
+
+
+def test_what_a_node_raises_has_the_result_with_it(here):
+    with pytest.raises(UserCodeError, match=r'^/api:tick: it raised FileNotFoundError: ') as info:
+        run(RunOptions(nodes=[Broken], graph='graph.yaml', duration='20s'))
+    assert isinstance(info.value.__cause__, FileNotFoundError)
+    assert info.value.result.callbacks['/api:tick']['failed'] >= 1
+    assert info.value.result.status == 70
+    with pytest.raises(MddagError, match=f'--node {__name__}:wrong: it failed while starting'):
+        run(RunOptions(nodes=[wrong]))
+    assert run(RunOptions(nodes=[Api], duration='100ms')).status == 0  # nothing is left of it
+
+
+@pytest.mark.parametrize(('given', 'line'), [
+    ({}, 'nodes: give nodes to run, or synthetic, and not both'),
+    ({'nodes': Api}, 'give a list, even for one node'),
+    ({'nodes': ['a:b'], 'duration': '2 parsecs'}, "duration='2 parsecs': "),
+    ({'nodes': ['a:b'], 'duration': -1}, "duration=-1: give a time such as '20s'"),
+    ({'synthetic': 'sleep'}, '--synthetic: it is about the nodes of a declaration: give a GRAPH'),
+    ({'synthetic': 'nap', 'graph': 'graph.yaml'}, "synthetic='nap': give one of sleep, spin, "),
+    ({'nodes': ['a:b'], 'utilisation': 0.5}, '--utilisation: it scales synthetic nodes only'),
+    ({'nodes': ['a:b'], 'graph': 'graph.yaml', 'processes': 0}, '--processes 0: give 1 or more'),
+    ({'nodes': ['a:b'], 'on_exit': 'panic'}, "on_exit='panic': give end or continue"),
+    ({'nodes': ['no_such_module:main']}, "there is no module 'no_such_module'"),
+    ({'nodes': [Api], 'policy': 'best'}, 'best'),
+    ({'nodes': [Api], 'workers': 0}, 'workers=0: give a whole number from 1 up'),
+    ({'nodes': [Api], 'trace': 'nowhere/x.mcap'}, 'there is no directory nowhere'),
+    ({'nodes': [Api], 'graph': 'graph.yaml', 'processes': 2},
+     'several processes need its name: give '),
+    ({'nodes': [4]}, 'makes no node'),
+])
+def test_what_is_wrong_is_said_in_one_line(here, given, line):
+    with pytest.raises(MddagError) as info:
+        run(RunOptions(**{'duration': '1s', **given}))
+    assert line in str(info.value) and '\n' not in str(info.value)
+    assert not rclpy.ok()
+
+
+def test_the_state_of_the_process_is_checked_first(here):
+    with pytest.raises(GraphError, match='nowhere.yaml'):
+        run(RunOptions(nodes=[Api], graph='nowhere.yaml'))
+    rclpy.init()
+    with pytest.raises(UsageError, match=r'initialised already .*: call rclpy\.shutdown\(\)'):
+        run(RunOptions(nodes=[Api]))
+    assert rclpy.ok()
+    rclpy.shutdown()
+
+
+INTERRUPTED = """\
+from mddag_executor.hosting import run, RunOptions
+from rclpy.node import Node
+
+class Api(Node):
+    def __init__(self):
+        super().__init__('api')
+        self.timer = self.create_timer(0.02, self.tick)
+
+    def tick(self):
+        self.timer.cancel()
+        print('runs', flush=True)
+
+for _ in range(2):
+    result = run(RunOptions(nodes=[Api], diagnostics=None))
+    print(sum(each['ran'] for each in result.callbacks.values()), flush=True)
+"""
+
+
+def test_ctrl_c_ends_the_run_and_may_end_the_next_one(here):
+    with subprocess.Popen(
+        [sys.executable, '-c', INTERRUPTED], stdout=subprocess.PIPE, text=True,
+    ) as process:
+        for _ in range(2):
+            assert process.stdout.readline() == 'runs\n'
+            process.send_signal(signal.SIGINT)
+            assert process.stdout.readline() == '1\n'
+    assert process.returncode == 0
