@@ -32,7 +32,15 @@ from mddag_executor.errors import InputError
 from mddag_executor.recording.entities import Callback, KINDS
 from mddag_executor.recording.head import is_declared
 from mddag_executor.recording.mapping import declared_keys
-from mddag_executor.recording.tables import Ints, Mask, Recording, rows_by, sort_by, VERTEX
+from mddag_executor.recording.tables import (
+    different,
+    Ints,
+    Mask,
+    Recording,
+    rows_by,
+    sort_by,
+    VERTEX,
+)
 from mddag_executor.sources.head import named_errors, read_head
 from mddag_executor.sources.open import open_recording
 from mddag_executor.trace import TraceReader
@@ -49,12 +57,19 @@ LEAST_SILENT, LEAST_SILENT_SHARE = 2, 0.02
 """A callback publishes only sometimes if more executions, and a larger share, were silent."""
 DRIVEN_SHARE = 0.15
 """The largest difference of two numbers of executions that count as equal."""
+COPIED_SHARE = 0.9
+"""A callback copies header stamps if so many of its messages have one of a received topic."""
 STORES_NS = 500_000
 """A callback that only stores its message takes no longer in nine of ten executions."""
 IRREGULAR = 3
 """Times between executions are irregular if one in ten is so many times another one in ten."""
 ONCE_PERIODS = 3
 """A timer fires once if it was silent for so many periods after its only execution."""
+
+
+LEAST_COPIED = 5
+"""From fewer messages with header stamps nothing is concluded."""
+_NO_STAMPS: Ints = np.empty(0, dtype=np.int64)
 
 
 class Runs(NamedTuple):
@@ -128,6 +143,7 @@ class System:
         for publisher in publishers.values():
             if publisher.node is not None:
                 self._publishers[publisher.node.name][publisher.topic] = False
+        self._find_headers(recording)
         sent = recording.publications[recording.publications['execution'] >= 0]
         pairs = np.stack((recording.executions['callback'][sent['execution']], sent['publisher']))
         different, first, pair = np.unique(pairs, axis=1, return_index=True, return_inverse=True)
@@ -143,6 +159,28 @@ class System:
                 runs.published[known.topic] = runs.published.get(known.topic, 0) + count
                 if known.node is not None:
                     self._publishers[known.node.name][known.topic] = True
+
+    def _find_headers(self, recording: Recording) -> None:
+        """Find the header stamps of messages, by node and topic, and by topic."""
+        self._sent_headers: dict[tuple[str, str], Ints] = {}
+        self._headers: dict[str, list[Ints]] = {}
+        sent, publishers = recording.publications, self._who.every_publisher
+        numbers, which = different(sent['publisher'])
+        for number, mine in zip(numbers.tolist(), rows_by(which, len(numbers))):
+            publisher, stamps = publishers.get(number), sent['header_stamp'][mine]
+            stamps = np.unique(stamps[stamps > 0])
+            if publisher is not None and len(stamps):
+                self._headers.setdefault(publisher.topic, []).append(stamps)
+                if publisher.node is not None:
+                    self._sent_headers[publisher.node.name, publisher.topic] = stamps
+
+    def _copied_share(self, node: str, topic: str, received: str) -> float:
+        """Return how many of a topic's messages from a node have a stamp of a received topic."""
+        stamps = self._sent_headers.get((node, topic), _NO_STAMPS)
+        there = self._headers.get(received)
+        if there is None or len(stamps) < LEAST_COPIED:
+            return 0.0
+        return float(np.isin(stamps, np.concatenate(there)).mean())
 
     def draft(self) -> Draft:
         """Return the whole system."""
@@ -174,10 +212,10 @@ class System:
 
     def _find_driven(self, node: DraftNode) -> None:
         """
-        Join the subscriptions of a node that publish one topic at the rate of one of them.
+        Join the subscriptions of a node that publish one topic from the messages of both.
 
-        They are a sync of different rates if several of them publish the topic, and together as
-        often as one of them runs.
+        They are a sync of different rates if several of them publish the topic, and its messages
+        have the header stamps of just one of their topics, or are as many as those of one.
         """
         declared = {callback.key for callback in self._declared.values()}
         subscriptions = [each for each in node.callbacks.values()
@@ -186,14 +224,23 @@ class System:
         for topic in topics:
             several = [each for each in subscriptions if topic in each.publishes
                        and each.kind == 'subscription' and each.name in node.callbacks]
-            runs = [each.runs or 0 for each in several]
-            if len({each.starts[0] for each in several}) < 2 or (
-                    max(runs) - min(runs) <= DRIVEN_SHARE * max(runs)):
+            if len({each.starts[0] for each in several}) < 2:
                 continue
             total = sum(_published_by(each, topic) for each in several)
-            driver = min(several, key=lambda each: abs((each.runs or 0) - total))
-            if abs((driver.runs or 0) - total) <= max(LEAST_SILENT, DRIVEN_SHARE * total):
-                _join(node, driver, [each for each in several if each is not driver], topic, total)
+            copied = [each for each in several if self._copied_share(
+                node.name, topic, each.starts[0]) >= COPIED_SHARE]
+            if len(copied) == 1:
+                driver, why = copied[0], (
+                    f'{topic} has the header stamps of {copied[0].starts[0]}')
+            else:
+                driver = min(several, key=lambda each: abs((each.runs or 0) - total))
+                runs = [each.runs or 0 for each in several]
+                if copied or max(runs) - min(runs) <= DRIVEN_SHARE * max(runs) or abs(
+                        (driver.runs or 0) - total) > max(LEAST_SILENT, DRIVEN_SHARE * total):
+                    continue
+                why = (f'its executions published {topic} {total} times, and '
+                       f'{driver.starts[0]} came {driver.runs} times')
+            _join(node, driver, [each for each in several if each is not driver], topic, why)
 
     def _processes(self, nodes: list[str]) -> dict[str, list[str]]:
         """Return the given nodes of each process; none if there is one process."""
@@ -329,12 +376,11 @@ def _published_by(callback: DraftCallback, topic: str) -> int:
 
 
 def _join(
-    node: DraftNode, driver: DraftCallback, others: list[DraftCallback], topic: str, total: int
+    node: DraftNode, driver: DraftCallback, others: list[DraftCallback], topic: str, why: str
 ) -> None:
-    """Make one sync of subscriptions, which the topic of one of them drives."""
+    """Make one sync of subscriptions for a topic, which the topic of one of them drives."""
     runs = driver.runs or 0
-    driver.why = (f'  # proposed: its executions published {topic} {total} times, and '
-                  f'{driver.starts[0]} came {runs} times')
+    driver.why = f'  # proposed: {why}'
     published = {
         each: sum(_published_by(c, each) for c in (driver, *others) if each in c.publishes)
         for each in dict.fromkeys(t for c in (driver, *others) for t in c.publishes)}
@@ -342,7 +388,7 @@ def _join(
     driver.publishes = list(published)
     driver.sometimes = {
         each: (count, runs) for each, count in published.items()
-        if runs - count > max(LEAST_SILENT, DRIVEN_SHARE * runs)}
+        if each != topic and runs - count > max(LEAST_SILENT, DRIVEN_SHARE * runs)}
     for other in others:
         driver.starts += other.starts
         if other.times is not None and (driver.times is None or (

@@ -18,7 +18,7 @@ import numpy as np
 
 VERSION = '1'
 _TIMES = {'release', 'noticed', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'time',
-          'source_timestamp', 'deadline', 'completed'}
+          'source_timestamp', 'header_stamp', 'deadline', 'completed'}
 _COMPLETES = 'nothing', 'leg', 'vertex'
 """Names of the values of ``completes``."""
 # Columns that are only used to build tables.

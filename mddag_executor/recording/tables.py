@@ -67,7 +67,8 @@ EXECUTIONS = _table(
     thread='i4', worker='i2', ready='i8', began='i8', start='i8', end='i8', busy='i8', cpu='i8',
     holds_gil='?', completes='i1', guessed='?', message='i4', order='i4')
 PUBLICATIONS = _table(
-    process='i2', publisher='i8', execution='i8', vertex='i4', time='i8', source_timestamp='i8')
+    process='i2', publisher='i8', execution='i8', vertex='i4', time='i8', source_timestamp='i8',
+    header_stamp='i8')
 TAKES = _table(execution='i8', message='i8', time='i8')
 JOB_ENDS = _table(
     process='i2', dag='i4', vertex='i4', job='i8', time='i8', reason='i1', order='i8')

@@ -135,7 +135,7 @@ class ImportedRun:
         """Link executions and messages."""
         #: The nodes and callbacks.
         self.who = Entities()
-        self.who.read(init)
+        self.who.read([event for event in init if event[0].name in INIT_EVENTS])
         self.links = self.links_type(self._events, self.who)
 
     def read(self) -> Recording:
@@ -239,6 +239,7 @@ class ImportedRun:
             PUBLICATIONS, len(messages), publisher=_values(
                 [each.number for each in publishers], messages['publisher']),
             execution=run, time=messages['time'], source_timestamp=messages['stamp'],
+            header_stamp=np.where(messages['header'] > 0, messages['header'], UNKNOWN),
             vertex=np.array(vertices, dtype=np.int64)[which])
 
     def _publisher_vertex(self, callback: int, publisher: int) -> int:

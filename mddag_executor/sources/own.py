@@ -74,7 +74,7 @@ _FIELDS = {
     DISPATCH: 'vtid callback dag vertex job worker ready',
     END: 'vtid callback',
     COMPLETE: 'vtid callback dag vertex job last_leg completed leg cpu_time held_interpreter',
-    _PUBLISH: 'vtid publisher_handle', _RELEASE: 'dag job release',
+    _PUBLISH: 'vtid publisher_handle message_timestamp', _RELEASE: 'dag job release',
     _DEADLINE: 'dag vertex job deadline completed', _DEMOTE: 'dag vertex job',
     _FAIL: 'dag vertex job', _EXPIRE: 'dag job', _ABORT: 'dag job', _OUTDATE: 'dag job',
     _LOST: 'count', _MESSAGES_LOST: 'callback count', _STOP: 'begin end',
@@ -249,7 +249,8 @@ class _Source:
         by = running_at(executions, completed, published['vtid'], time, published['place'])
         table = rows(
             PUBLICATIONS, len(published), publisher=published['publisher_handle'],
-            execution=by, vertex=UNKNOWN, time=time, source_timestamp=UNKNOWN)
+            execution=by, vertex=UNKNOWN, time=time, source_timestamp=UNKNOWN,
+            header_stamp=_known(published['message_timestamp']))
         known = by >= 0     # a killed run may have publications, and no execution
         table['vertex'][known] = executions['vertex'][by[known]]
         return table
@@ -397,6 +398,12 @@ class _Source:
             lines.append(
                 f'{name}: {counted(orphans, "completed execution")} whose start is not in it')
         return lines
+
+
+def _known(stamps: Ints) -> Ints:
+    """Return header stamps with UNKNOWN for messages without one."""
+    found: Ints = np.where(stamps > 0, stamps, UNKNOWN)
+    return found
 
 
 def _one_row(event: Event) -> Table:

@@ -128,6 +128,19 @@ def test_the_same_run_gets_the_same_verdicts(tmp_path, call):
                 assert abs(mean['release_lag_ns'] - wanted['release_lag_ns']) < MS
 
 
+def test_dropped_messages_and_callbacks_of_actions_are_no_damage(run):
+    """Of the callback of an action, a client or a task only the name is recorded."""
+    run.add('rclcpp_callback_register', 0, 77, '/arm: ActionServer (waitable)')
+    for job in range(3):
+        run.runs(GRAB, 100 * job, 100 * job + 2, 100 * job + 1)
+        run.detects(100 * job + 1)
+        run.runs(77, 100 * job + 50, 100 * job + 51)
+    run.add('drop', 250, RUN, -1, -1, -1, 'qos_depth')
+    result = run.result(300)
+    assert not any('initialisation' in line for line in result['warnings'])
+    assert (of_camera(result)['completed'], result['dropped']) == (3, {'qos_depth': 1})
+
+
 def test_messages_of_others_are_of_no_job(run):
     # another process publishes while nothing of this one is being sent, or while /camera still
     # runs: its own message has been taken then
