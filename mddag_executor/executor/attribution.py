@@ -240,8 +240,8 @@ class Attribution:
         """Send a message and note the publication; the caller holds the publisher's lock."""
         if topic.on_header is not None:
             topic.on_header(header_stamp(msg), origin)
-        if topic.is_optional and origin is not NO_ORIGIN:
-            self._note_optional(state.topic, origin)
+        if topic.is_optional:
+            self.note_optional(state.topic, origin)
         publication = Publication(time_ns(), state.numbers, origin, state.count)
         interrupted, state.sending = state.sending, publication
         if interrupted is not None:  # by a signal handler: the order of the numbers is unknown
@@ -261,7 +261,10 @@ class Attribution:
                 self._announce_when_alone(send, state.topic, topic, publication)
         return publication
 
-    def _note_optional(self, topic: str, origin: Origin) -> None:
+    def note_optional(self, topic: str, origin: Origin) -> None:
+        """Note that an execution has published a topic, if that is published only sometimes."""
+        if origin is NO_ORIGIN or topic not in self.topics or not self.topics[topic].is_optional:
+            return
         published = self._published
         published.setdefault((origin.dag, origin.job, origin.vertex), set()).add(topic)
         if len(published) > 2 * REMEMBERED:  # of jobs that ended before these vertices completed

@@ -646,20 +646,33 @@ class Engine:
         A thread that publishes calls this without the lock.
         """
         awaiting = work.entity.awaiting
-        assert awaiting is not None
+        if awaiting is None:
+            return
         work.published |= {topic}
         if work.origin is None:
             work.answers = awaiting.named(
                 topic, header_stamp(message), work.answers) or NO_ORIGIN
+
+    def origin_of(self, work: Work) -> Origin | None:
+        """Return the job of what an execution publishes; None: it has none."""
+        origin = work.origin or work.answers
+        return None if origin is NO_ORIGIN else origin
+
+    def answered_job(self, work: Work) -> Origin | None:
+        """Return the open job that an execution of a driven sync answers so far, if any."""
+        awaiting, job = work.entity.awaiting, work.answers
+        if awaiting is None or job is None or job is NO_ORIGIN or not (
+                self._is_open(job) and awaiting.is_answer(work.published)):
+            return None
+        return job
 
     def _is_open(self, origin: Origin) -> bool:
         return self.open_release(origin) is not None
 
     def _answered(self, work: Work) -> list[Origin]:
         """Return the jobs whose driven sync an execution completes, the one it answers first."""
-        awaiting, job = work.entity.awaiting, work.answers
-        if awaiting is None or job is None or job is NO_ORIGIN or not (
-                self._is_open(job) and awaiting.is_answer(work.published)):
+        awaiting, job = work.entity.awaiting, self.answered_job(work)
+        if awaiting is None or job is None:
             return []
         return [each for each in awaiting.answer(job) if self._is_open(each)]
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from functools import cache
 
-from mddag_executor.core import quantile, Tables
+from mddag_executor.core import NEVER, quantile, Tables
 from mddag_executor.simulate.load import as_lists, edge_numbers, Load, needs_python
 
 
@@ -80,14 +80,20 @@ class Durations:
         return self._values(column, vertex, edge)[self._row(dag, release)]
 
     def _values_of_jobs(self, column: str, vertex: int, edge: int | None) -> list[int]:
-        """Return a value of each recorded job, in the order of releases, then their median."""
+        """
+        Return a value of each recorded job, in the order of releases, then their median.
+
+        A job in which nothing was published has the median delay: the rerun may publish there.
+        """
         load, dag = self._load, self._tables.dag_of[vertex]
         first = load.cost_base[dag] + vertex - self._tables.first_vertex[dag]
         stride, values = load.cost_stride[dag], getattr(load, column)
         if edge is not None:
             first, stride = load.delay_base[dag] + edge, load.delay_stride[dag]
         found = [values[first + job * stride] for _, job in self._releases[dag]]
-        return [*found, quantile(sorted(found), 0.5) if found else 0]
+        known = sorted(value for value in found if value < NEVER)
+        median = quantile(known, 0.5) if known else 0
+        return [*(value if value < NEVER else median for value in found), median]
 
     def _row(self, dag: int, release: int) -> int:
         """Return the place of the recorded job that was released about then; -1: there is none."""

@@ -265,11 +265,17 @@ class Loop:
         origin = work.origin
         release = 0 if origin is None else self.engine.release_of(work)
         execution = Execution(work, self.now, work.worker, work.worker + 1, release)
-        takes = self._execution_time(work, origin, release)
+        is_driven = work.entity.awaiting is not None
+        takes = 0 if is_driven else self._execution_time(work, origin, release)
         begins(self._state, self._machine, work.x, 0, -1)  # for now it needs nothing
         if not self._call(execution):
             return
         self.callbacks += 1
+        if is_driven:   # one that does not answer only stores its message
+            origin = self.engine.answered_job(work)
+            release = self.engine.open_release(origin) or 0 if origin is not None else 0
+            if origin is not None and work.coroutine is None:
+                takes = self._times.execution(origin.vertex, release)
         if origin is not None and takes:
             work.cpu_ns = max(0, self._times.computed(origin.vertex, release))
             work.entity.habit.took(takes, takes)
@@ -325,6 +331,7 @@ class Loop:
         """End an execution in virtual time, or suspend it."""
         work, engine, worker = execution.work, self.engine, execution.worker
         start, waits_for, now = execution.start, execution.waits_for, self.now
+        origin = self._origin_of(execution)
         for _, record in execution.sent:
             record(execution.thread)  # before its callback's end
         if waits_for is None:
@@ -334,9 +341,17 @@ class Loop:
             engine.suspended(work, start, now, execution.thread, worker)
             self._resume_when_done(work, waits_for)
         for leave, _ in execution.sent:
-            leave(execution.work.origin, execution.release)
+            leave(*origin)
         if engine.to_ask_again:
             engine.ask_again()
+
+    def _origin_of(self, execution: Execution) -> tuple[Origin | None, int]:
+        """Return the job of what an execution publishes, and its release."""
+        work = execution.work
+        origin = self.engine.origin_of(work)
+        if origin is None or origin is work.origin:
+            return origin, execution.release
+        return origin, self.engine.open_release(origin) or 0
 
     def _resume_when_done(self, work: Work, waits_for: Any) -> None:
         def resume() -> None:
@@ -386,7 +401,7 @@ class Loop:
             sent, execution.sent = execution.sent, []
             for leave, record in sent:
                 record(execution.thread)
-                leave(execution.work.origin, execution.release)
+                leave(*self._origin_of(execution))
             if lends and execution.worker >= 0 and execution.work.x >= 0:
                 self.engine.lend(execution.work)
                 execution.worker = -1

@@ -34,7 +34,7 @@ import re
 from typing import Any
 
 from mddag_executor.clocks import TraceClock
-from mddag_executor.executor.attribution import header_stamp, Origin
+from mddag_executor.executor.attribution import header_stamp, NO_ORIGIN, Origin
 from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.publishing import state_of
@@ -171,6 +171,7 @@ class Messages:
         outlet = self._outlets.get(publisher)
         if outlet is None:
             outlet = self._outlets[publisher] = Outlet(publisher)
+            self._loop.changed = True   # it may be new: it is recorded with its node
         return outlet
 
     # --- questions about the ROS graph -----------------------------------------------------------
@@ -212,7 +213,11 @@ class Messages:
                 'that happens depends on the machine')
         current = self._loop.current
         if current is not None:
-            current.work.entity.publishes.add(outlet.state.topic)
+            work, topic = current.work, outlet.state.topic
+            work.entity.publishes.add(topic)
+            self._engine.note_published(work, topic, msg)
+            self._engine.attribution.note_optional(
+                topic, self._engine.origin_of(work) or NO_ORIGIN)
         self._loop.send(partial(self._leave, outlet, data),
                         partial(self._record, outlet, max(0, header_stamp(msg))))
 

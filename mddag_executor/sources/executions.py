@@ -51,6 +51,8 @@ import numpy as np
 PARTS = DISPATCH, END, COMPLETE = ('mddag:dispatch', 'ros2:callback_end', 'mddag:complete')
 COMPLETED = np.dtype([('place', 'i8'), ('time', 'i8'), ('row', 'i8')])
 """Completions: position in the file, time, row of the execution."""
+_MOST_NESTED = 32
+"""So many executions in a row may have ended while an earlier one went on in their thread."""
 _FAR = 1 << 40
 """More than any position in a file."""
 
@@ -350,19 +352,20 @@ def running_at(
             order = sort_by(start, -end)
             mine, start, end = mine[order], start[order], end[order]
         at = np.searchsorted(start, time[asked], 'right') - 1
-        # a nested execution may have ended before
-        for _ in range(32):
+        # a nested execution, or one that took no time, may have ended before
+        for _ in range(_MOST_NESTED):
             outer = (at >= 0) & (end[np.maximum(at, 0)] < time[asked])
             if not outer.any():
                 break
             at[outer] -= 1
-        later = completed_at[mine]
-        for _ in range(len(mine)):
-            one = np.maximum(at - 1, 0)
-            before = (at > 0) & (end[one] == time[asked]) & (later[one] > place[asked])
-            if not before.any():
-                break
-            at[before] -= 1
+        later, one, over = completed_at[mine], at.copy(), np.zeros(len(at), dtype=np.int64)
+        goes_on = (at > 0) & (start[np.maximum(at, 0)] == time[asked])
+        while goes_on.any():
+            one[goes_on] -= 1
+            found_one = goes_on & (end[one] == time[asked]) & (later[one] > place[asked])
+            at[found_one] = one[found_one]
+            over = np.where(found_one, 0, over + 1)
+            goes_on &= (one > 0) & (found_one | (end[one] < time[asked]) & (over < _MOST_NESTED))
         good = (at >= 0) & (end[np.maximum(at, 0)] >= time[asked])
         found[asked[good]] = mine[at[good]]
     return found

@@ -420,3 +420,112 @@ def test_a_circle_that_takes_no_time(bag, graph, monkeypatch):
 
     with pytest.raises(RerunError, match='virtual time does not advance after 0.010000 s'):
         run_filter(bag, graph, lambda node, number: node.round.publish(Header()), fill=fill)
+
+
+# --- ordinary robots -------------------------------------------------------------------------
+
+class Ticker(Node):
+    """Publishes the number of the call, and the time, whenever its timer fires."""
+
+    def __init__(self, name, topic, period):
+        super().__init__(name)
+        self.count = 0
+        self.publisher = self.create_publisher(Header, topic, 10)
+        self.create_timer(period, self.tick)
+
+    def tick(self):
+        self.publisher.publish(Header(
+            stamp=self.get_clock().now().to_msg(), frame_id=str(self.count)))
+        self.count += 1
+
+
+class Sometimes(Filter):
+    """Passes on only each so-manieth message."""
+
+    def __init__(self, each):
+        super().__init__()
+        self.each = each
+
+    def take(self, message):
+        if int(message.frame_id) % self.each == 0:
+            super().take(message)
+
+
+def verdicts(result):
+    return {name: (sink['completed'], sink['late'], sink['expired'], sink.get('not_due', 0))
+            for dag in result['dags'].values() for name, sink in dag['sinks'].items()}
+
+
+def test_what_is_published_sometimes_is_judged_when_it_is(tmp_path):
+    """Also when the rerun publishes in other jobs than the recorded run did."""
+    graph = loads(GRAPH.replace('publishes: [/filtered]', 'may_publish: [/filtered]'))
+    driver, first, second = partial(Ticker, 'driver', '/points', 0.1), 'a.mcap', 'b.mcap'
+    bag = write_bag(tmp_path / 'bag.mcap', [(ms, '/other', Header()) for ms in range(0, 2000, 50)])
+    result = rerun(bag, graph, [driver, partial(Sometimes, 3), Sink],
+                   trace=str(tmp_path / first)).result()
+    completed, _, _, not_due = verdicts(result)['/sink:take']
+    assert verdicts(result)['/sink:take'] == (completed, 0, 0, not_due)
+    assert completed >= 6 and completed + not_due >= 19
+    assert verdicts(replay(tmp_path / first).result()) == verdicts(result)
+    result = rerun(str(tmp_path / first), graph, [driver, partial(Sometimes, 2), Sink],
+                   trace=str(tmp_path / second)).result()
+    assert verdicts(result)['/sink:take'][0] >= 9
+    assert verdicts(result)['/sink:take'][1:3] == (0, 0)
+    assert verdicts(replay(tmp_path / second).result()) == verdicts(result)
+
+
+FUSED = """\
+mddag: 1
+workers: 2
+nodes:
+  - node: /driver
+    callbacks:
+      - {name: drive, timer: 100ms, publishes: [/points]}
+  - node: /boxes
+    callbacks:
+      - {name: find, timer: 70ms, publishes: [/boxes], deadline: none}
+  - node: /fusion
+    callbacks:
+      - name: fuse
+        sync: {topics: [/points, /boxes], driven_by: /points}
+        publishes: [/filtered]
+        execution_time: 10ms
+  - node: /sink
+    callbacks:
+      - {name: take, subscription: /filtered, execution_time: 5ms, deadline: 95ms}
+"""
+
+
+class Fusion(Node):
+    """Fuses each scan with the next boxes."""
+
+    def __init__(self):
+        super().__init__('fusion')
+        self.scan = None
+        self.publisher = self.create_publisher(Header, '/filtered', 10)
+        self.create_subscription(Header, '/points', self.take_points, 10)
+        self.create_subscription(Header, '/boxes', self.take_boxes, 10)
+
+    def take_points(self, scan):
+        self.scan = scan
+
+    def take_boxes(self, boxes):
+        if self.scan is not None:
+            self.publisher.publish(self.scan)
+            self.scan = None
+
+
+def test_a_sync_of_two_rates_answers_its_driving_messages(tmp_path):
+    """Only the execution that fuses takes time; the wait for the boxes counts."""
+    bag = write_bag(tmp_path / 'bag.mcap', [(ms, '/other', Header()) for ms in range(0, 2000, 50)])
+    trace = tmp_path / 'a.mcap'
+    result = rerun(
+        bag, loads(FUSED), [partial(Ticker, 'driver', '/points', 0.1),
+                            partial(Ticker, 'boxes', '/boxes', 0.07), Fusion, Sink],
+        trace=str(trace)).result()
+    sink = result['dags']['/driver']['sinks']['/sink:take']
+    assert sink['completed'] >= 18
+    assert (sink['late'], sink['expired']) == (0, 0)
+    # the boxes come at most 70 ms after the scan
+    assert 15 * MS < sink['response_ns']['max'] <= 85 * MS
+    assert verdicts(replay(trace).result()) == verdicts(result)
