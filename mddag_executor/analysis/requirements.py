@@ -22,11 +22,13 @@ from mddag_executor.results.sinks import Requirements as Results
 from msg_graph import Path
 import numpy as np
 
-RESULTS = np.dtype([('kind', 'i1'), ('since', 'i8'), ('end', 'i8'), ('step', 'i8')])
+RESULTS = np.dtype([
+    ('kind', 'i1'), ('since', 'i8'), ('end', 'i8'), ('step', 'i8'), ('count', 'i8')])
 """
 Columns of a result: the core's decision, the time of the change or input, the end of the output.
 
-``step`` is that of the output.  Both are -1 if there is none.
+``step`` is that of the output.  Both are -1 if there is none.  ``count`` is the number of equal
+results: all outputs that did not come are one row.
 """
 
 
@@ -100,7 +102,7 @@ class Requirements:
         judged = self._is_judged(since) & (not_due | answered | overdue)
         found: Table = rows(
             RESULTS, len(since), kind=kind, since=since, end=np.where(answered, answer, NONE),
-            step=np.where(answered, step[best], NONE))[judged]
+            step=np.where(answered, step[best], NONE), count=1)[judged]
         return found
 
     def _ages(self, flows: Flows, rules: Rules, required: int) -> Table:
@@ -112,7 +114,7 @@ class Requirements:
         since, end = flows.begin[newest], flows.end[newest]
         kind = np.where(end - since > required, SINK_LATE, SINK_IN_TIME)
         found = rows(RESULTS, len(end), kind=kind, since=since, end=end,
-                     step=flows.step[newest])[self._is_judged(since)]
+                     step=flows.step[newest], count=1)[self._is_judged(since)]
         begins = flows.begin[flows.begin != NONE]
         begins = begins[self._is_judged(begins)]
         if not len(begins) or not self._recording.judged:
@@ -120,7 +122,8 @@ class Requirements:
         last = int(found['end'].max(initial=begins.min()))
         missing = rules.missing_outputs(last, min(self._until, self._to), required)
         return concatenate([found, rows(
-            RESULTS, missing, kind=SINK_MISSED, since=last, end=NONE, step=NONE)])
+            RESULTS, int(missing > 0), kind=SINK_MISSED, since=last, end=NONE, step=NONE,
+            count=missing)])
 
     def result(self) -> Results:
         """Return by path, and 'reaction' or 'age', its result in the format of a sink."""
@@ -128,7 +131,8 @@ class Requirements:
         for (number, what), table in self.results.items():
             path = self._paths.paths[number]
             tally = RequirementTally(path, path.requirements[what])
-            tally.add_all(table['kind'].tolist(), (table['end'] - table['since']).tolist())
+            tally.add_all(*(each.tolist() for each in (
+                table['kind'], table['end'] - table['since'], table['count'])))
             found.setdefault(path.name, {})[what] = tally.result_with()
         return found
 
@@ -150,7 +154,7 @@ class Requirements:
             steps = self._paths.steps(number)
             for what, table in mine.items():
                 late = table[table['kind'] == SINK_LATE]
-                unanswered = int((table['kind'] == SINK_MISSED).sum())
+                unanswered = int(table['count'][table['kind'] == SINK_MISSED].sum())
                 if len(late) or unanswered:
                     found.setdefault(path.name, {})[what] = {
                         'late': len(late), 'unanswered': unanswered,

@@ -75,22 +75,28 @@ class RequirementTally(SinkTally):
         self.done(took, late)
         self._next(late)
 
-    def add_missed(self) -> None:
-        """Count a change that is not answered, or an output that has not come."""
-        self.numbers[SINK_MISSED] += 1
-        self._next(True)
+    def add_missed(self, n: int = 1) -> None:
+        """Count changes that are not answered, or outputs that have not come."""
+        self.numbers[SINK_MISSED] += n
+        # more misses in a row than the window has change nothing
+        last = 0 if self._window is None else min(n, self._window.of)
+        self._results += n - last
+        for _ in range(last):
+            self._next(True)
 
     def add_not_due(self) -> None:
         """Count a change that is not due."""
         self.numbers[SINK_NOT_DUE] += 1
 
-    def add_all(self, kinds: Iterable[int], took: Iterable[int]) -> None:
+    def add_all(
+        self, kinds: Iterable[int], took: Iterable[int], numbers: Iterable[int]
+    ) -> None:
         """Count results in order; their times are used if they have one."""
-        for kind, each in zip(kinds, took):
+        for kind, each, n in zip(kinds, took, numbers):
             if kind == SINK_NOT_DUE:
                 self.add_not_due()
             elif kind == SINK_MISSED:
-                self.add_missed()
+                self.add_missed(n)
             else:
                 assert kind in (SINK_IN_TIME, SINK_LATE)
                 self.add(each)
@@ -115,7 +121,7 @@ class RequirementTally(SinkTally):
             found['tolerate'] = {
                 'misses': self._tolerate.misses, 'of': self._tolerate.of,
                 'worst': self._window.worst_with(
-                    range(self._results + 1, self._results + 1 + missed))}
+                    range(self._results + 1, self._results + 1 + min(missed, self._window.of)))}
         return found
 
 

@@ -218,8 +218,9 @@ def _lines(data: ReportData, names: list[str]) -> tuple[list[Line], list[int]]:
     short = short_names(vertex.name for dag in dags for vertex in dag.vertices)
     lines: list[Line] = []
     line_of = [0] * len(names)
-    for dag in sorted(dags, key=lambda dag: -max(
-            missed_share(counts(sink)) for sink in sinks[dag.name]['sinks'].values())):
+    for dag in sorted(dags, key=lambda dag: -max((
+            missed_share(counts(sink)) for sink in sinks[dag.name]['sinks'].values()),
+            default=0.0)):      # all of its sinks may have `deadline: none`
         first, name = data.replay.judged.tables.first_vertex[dag.index], printable(dag.name)
         every = f'every {format_ns(dag.period_ns)}'
         if len(dag.vertices) == 1:      # needs no title

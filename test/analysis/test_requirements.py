@@ -127,6 +127,21 @@ def test_a_dead_path_is_late(tmp_path):
     assert found == {'reaction': (8, 0, 9, 0, 29), 'age': (5, 0, 4, 0, 9)}
 
 
+def test_outputs_that_do_not_come_for_years_are_only_counted(tmp_path):
+    """As in a trace with a damaged time: there are 50 thousand million of them."""
+    told = Told(tmp_path / 'a.mcap', GRAPH + '    tolerate: 2 of 5\n')
+    for at in (0, 10 ** 12):
+        told.ran('/imu:sample', at, at + 2, sends=[(at + 1, '/imu')])
+    told.ran('/fuse:on_imu', 2, 3, 1, '/imu')
+    told.ran('/fuse:estimate', 5, 7, sends=[(6, '/pose')])
+    told.ran('/wheels:drive', 7, 9, 6, '/pose')
+    outcome = replay(told.write(), told.task_set)
+    age = next(iter(outcome.result()['requirements'].values()))['age']
+    assert age['overdue'] == age['late'] == pytest.approx(10 ** 12 / 20, rel=1e-6)
+    assert age['tolerate']['worst'] == 5
+    assert outcome.table('requirements')['count'].tolist()[-1] == age['overdue']
+
+
 RARE = """\
 mddag: 1
 nodes:
@@ -243,7 +258,7 @@ def test_reactions_are_those_of_slow_rules(flows, sampled, required, until):
         Flows(begin, end, begin, end, silent, np.arange(len(flows))), Rule(sampled), required)
     assert [row[:2] if row[2] == -1 else row[:3] for row in table.tolist()] == slow_reactions(
         flows, sampled, required, until)
-    for _, _, ended, step in table.tolist():
+    for _, _, ended, step, _ in table.tolist():
         assert ended == -1 or end[step] == ended
 
 

@@ -129,8 +129,10 @@ def test_paths_and_what_is_required_of_them(outcome):
         assert sum(row['arrival'] is not None for row in mine) == path['arrived']
     for name, about in result.get('requirements', {}).items():
         for what, found in about.items():
-            kinds = Counter(row['verdict'] for row in required
-                            if (row['path'], row['requirement']) == (name, what))
+            kinds = Counter()
+            for row in required:
+                if (row['path'], row['requirement']) == (name, what):
+                    kinds[row['verdict']] += row['count']
             every = counts(found)
             assert kinds['in_time'] == every.in_time and kinds['not_due'] == every.not_due
             assert kinds['late'] + kinds['overdue'] == every.late

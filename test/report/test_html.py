@@ -265,3 +265,20 @@ def test_a_report_computes_nothing_twice(tmp_path, call, monkeypatch):
     done = call('replay', runs.by_hand(tmp_path / 'run.mcap'), '--json', tmp_path / 'a.json',
                 '--report', tmp_path / 'r.html')
     assert done.returncode == 0 and len(calls) == len(set(calls)) == 3
+
+
+def test_a_dag_without_deadlines_has_a_report(tmp_path, call):
+    (tmp_path / 'g.yaml').write_text("""\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: log, timer: 20ms, deadline: none, execution_time: 1ms}
+      - {name: act, timer: 10ms, deadline: 5ms, execution_time: 1ms}
+""")
+    done = call('simulate', tmp_path / 'g.yaml', '--duration', '100ms', '--trace',
+                tmp_path / 'r.mcap', '--report', tmp_path / 'a.html')
+    assert (done.returncode, done.stderr) == (0, '')
+    done = call('replay', tmp_path / 'r.mcap', '--report', tmp_path / 'b.html')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'log' in (tmp_path / 'b.html').read_text()

@@ -26,6 +26,7 @@ def _named(table: Table, path: str, what: str) -> Table:
     return Table({
         'path': np.full(len(table), path, dtype=object),
         'requirement': np.full(len(table), what, dtype=object), 'verdict': table['kind'],
+        'count': table['count'],
         'since': table['since'], 'end': table['end'],
         'time': np.where(table['end'] >= 0, table['end'] - table['since'], -1)})
 
@@ -34,6 +35,7 @@ TABLE = ResultTable('requirements', 'judged reaction or data age of each path', 
     'path': Column('the path'),
     'requirement': Column('`reaction` or `age`'),
     'verdict': Column('`in_time`, `late`, `overdue` or `not_due`', names=_NAMES),
+    'count': Column('number of such results: all outputs that did not come are one row'),
     'since': Column('the input of the output or, for an external change, the one before it', 'ns'),
     'end': Column('end of the output; unknown: there was none', 'ns', unknown=-1),
     'time': Column('the reaction time or data age', 'ns', unknown=-1)}, _make)
