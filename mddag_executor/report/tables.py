@@ -97,27 +97,63 @@ def requirement_columns(
             lambda each: [each.name, *cells(each)])
 
 
+class SinkColumn(NamedTuple):
+    """
+    A column of the table of sinks.
+
+    :ivar cell: returns the cell of a sink's result.
+    :ivar needed: whether a sink needs the column: it is shown if any does; None: always.
+    """
+
+    title: str
+    cell: Callable[[Mapping[str, Any]], Cell]
+    needed: Callable[[Mapping[str, Any]], bool] | None = None
+
+
+def _counted(name: str) -> SinkColumn:
+    """Return a column of counts that is only shown if some are not 0."""
+    def count(sink: Mapping[str, Any]) -> int:
+        number: int = getattr(counts(sink), name)
+        return number
+
+    return SinkColumn(name.replace('_', ' '), count, lambda sink: bool(count(sink)))
+
+
+def _in_time(sink: Mapping[str, Any]) -> str:
+    verdicts = counts(sink)
+    return percent(verdicts.in_time, verdicts.due)
+
+
+def _tolerates(sink: Mapping[str, Any]) -> str:
+    limit = sink.get('tolerate')
+    return '' if limit is None else f'{limit["misses"]} of {limit["of"]}'
+
+
+def _response_time(name: str) -> SinkColumn:
+    return SinkColumn(name, lambda sink: times(sink['response_ns'], name)[0])
+
+
+RARE = 'failed', 'aborted', 'dropped', 'demoted', 'not_due'
+"""Counts that are only shown if they are not 0."""
+SINK_COLUMNS = (
+    SinkColumn('due', lambda sink: counts(sink).due),
+    SinkColumn('in time', _in_time),
+    SinkColumn('late', lambda sink: counts(sink).late),
+    *map(_counted, ('expired', *RARE)),
+    *map(_response_time, ('median', 'p99', 'max')),
+    SinkColumn('deadline', lambda sink: format_ns(sink['relative_deadline_ns'])),
+    SinkColumn('tolerates', _tolerates, lambda sink: 'tolerate' in sink),
+    SinkColumn('worst', lambda sink: sink['tolerate']['worst'] if 'tolerate' in sink else '',
+               lambda sink: 'tolerate' in sink))
+"""The columns of the table of sinks, after the names of the DAG and the sink."""
+
+
 def sink_columns(dags: Mapping[str, Any]) -> tuple[list[str], Callable[[Sink], list[Cell]]]:
     """Return the titles of a sink's columns after its name, and what gives its cells."""
-    tolerates = any('tolerate' in sink for dag in dags.values() for sink in dag['sinks'].values())
-    every = total(dags)
-    rare = ['expired'] * bool(every.expired) + rare_ends(every)
-
-    def cells(sink: Sink) -> list[Cell]:
-        verdicts, result = counts(sink.result), sink.result
-        row: list[Cell] = [
-            verdicts.due, percent(verdicts.in_time, verdicts.due), verdicts.late,
-            *(getattr(verdicts, name) for name in rare),
-            *times(result['response_ns'], 'median', 'p99', 'max'),
-            format_ns(result['relative_deadline_ns'])]
-        if tolerates:
-            limit = result.get('tolerate')
-            row += ['', ''] if limit is None else [
-                f'{limit["misses"]} of {limit["of"]}', limit['worst']]
-        return row
-
-    return ['due', 'in time', 'late', *(name.replace('_', ' ') for name in rare),
-            'median', 'p99', 'max', 'deadline', *['tolerates', 'worst'] * tolerates], cells
+    sinks = [sink for dag in dags.values() for sink in dag['sinks'].values()]
+    shown = [each for each in SINK_COLUMNS if each.needed is None or any(map(each.needed, sinks))]
+    return ([each.title for each in shown],
+            lambda sink: [each.cell(sink.result) for each in shown])
 
 
 def worst_first(dags: Mapping[str, Any]) -> list[Sink]:
@@ -132,8 +168,7 @@ def missed_share(verdicts: Counts) -> float:
 
 def rare_ends(every: Counts) -> list[str]:
     """Return the counts that are only shown if they are not 0."""
-    return [name for name in ('failed', 'aborted', 'dropped', 'demoted', 'not_due')
-            if getattr(every, name)]
+    return [name for name in RARE if getattr(every, name)]
 
 
 def times(values: Mapping[str, Any] | None, *keys: str) -> list[Cell]:
