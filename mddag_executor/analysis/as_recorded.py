@@ -18,7 +18,8 @@ from mddag_executor.analysis.usage import group_waits, share, Usage
 from mddag_executor.core import NEVER
 from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import ReplayError
-from mddag_executor.recording.tables import Recording, TABLES
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import TABLES
 from mddag_executor.results.replays import (
     RecordedFile,
     ReplayedDag,
@@ -48,7 +49,7 @@ class Replay:
         self.recording, self.task_set = recording, recording.task_set
         self.judged = Judged(recording, skip)
         self.tally = self.judged.tally
-        self.warnings = list(recording.warnings)
+        self.warnings = list(recording.missing.lines())
         if self.judged.contradictions:
             self.warnings.append(
                 f'{recording.name}: left out: {counted(self.judged.contradictions, "event")} that '
@@ -59,7 +60,7 @@ class Replay:
             self.warnings.append(
                 f'{recording.name}: {counted(int(early.sum()), "result")} before the release of '
                 'the job: clocks differ, or times are damaged')
-        differences = self.judged.differences() if recording.shut_down else None
+        differences = self.judged.differences() if recording.run.shut_down else None
         if differences is not None:
             self.warnings.append(f'{recording.name}: {differences}')
 
@@ -125,14 +126,14 @@ class Replay:
 
         Without jobs it is the duration of the recording.
         """
-        recording, begun = self.recording, self.recording.head.time
+        recording, begun = self.recording, self.recording.run.head.time
         start = begun if recording.start is None else recording.start
         return max(0, recording.end - (
             start if len(recording.releases) else min(start, begun)))
 
     def result(self) -> ReplayResult:
         """Return the result format of ``replay --json``."""
-        recording, head, duration = self.recording, self.recording.head, self.duration_ns
+        recording, head, duration = self.recording, self.recording.run.head, self.duration_ns
         paths = self.paths.results()    # first, because they need the most memory
         guesses: ReplayResultRare = {}
         if guessed := recording.guessed:
@@ -140,7 +141,7 @@ class Replay:
         more: ReplayResultRare = {}
         if requirements := self.requirements.result():
             more['requirements'] = requirements
-        if recording.imported:
+        if recording.run.imported:
             more['recorded_callbacks'] = recorded_callbacks(recording)
             more['communications'] = communications(recording)
         verdicts = self.tally.result()
@@ -198,13 +199,14 @@ def slack(sink: SinkCounts) -> SlackTimes | None:
         'median': deadline - response['median'], 'max': deadline - response['min']}
 
 
-def recording_result(run: Recording) -> RecordedFile:
+def recording_result(recording: Recording) -> RecordedFile:
     """Return the part of a result that describes the trace."""
+    run = recording.run
     found: RecordedFile = {
         'trace': run.name, 'declaration': run.head.file, 'start_ns': run.start,
         'end_ns': run.end}
     if run.messages is None:
-        found.update({'shut_down': run.shut_down, 'lost': run.lost})
+        found.update({'shut_down': run.shut_down, 'lost': recording.missing.count('events')})
     else:
         found['messages'] = run.messages
     return found
@@ -222,7 +224,7 @@ def replay(
     :raises mddag_executor.ReplayError: if it cannot be replayed, as an ordinary bag.
     """
     recording = open_recording(path, task_set, name, progress)
-    if recording.messages is not None:
+    if recording.run.messages is not None:
         raise ReplayError(recording.name, 'it is an ordinary bag, in which no callback ran',
                           'reschedule it')
     return Replay(recording if span is None else recording.cut(*span), skip)

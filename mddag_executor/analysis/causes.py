@@ -48,9 +48,9 @@ from typing import Any, NamedTuple
 
 from mddag_executor.analysis.spans import Spans
 from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
-from mddag_executor.recording.columns import concatenate, Table
+from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.columns import rows as table_of
-from mddag_executor.recording.tables import Ints, Mask
+from mddag_executor.recording.joins import as_of
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
@@ -193,7 +193,7 @@ class Never(NamedTuple):
             job, ready, start = mine['job'], mine['ready'], mine['start']
             latest = np.maximum.accumulate(start)
             asked = np.flatnonzero(vertices == vertex)
-            before = np.searchsorted(ready, times[asked], 'right') - 1
+            before = as_of(ready, times[asked])
             asked, before = asked[before >= 0], before[before >= 0]
             waits = latest[before] > times[asked]
             last = np.maximum.accumulate(np.where(start == latest, np.arange(len(start)), 0))

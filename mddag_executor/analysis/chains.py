@@ -39,8 +39,9 @@ from typing import Any, cast, NamedTuple
 from mddag_executor.analysis.deadlines import Judged
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
-from mddag_executor.recording.columns import concatenate, rows, Table
-from mddag_executor.recording.tables import EXECUTIONS, Ints, LEG, Mask, rows_by, sort_by
+from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
+from mddag_executor.recording.joins import rows_by, sort_by
+from mddag_executor.recording.tables import EXECUTIONS, LEG
 from mddag_executor.results.replays import Breakdown, ChainLink, ResponseParts, WorstJob
 from msg_graph import TaskSet
 from msg_graph.model import topological_order

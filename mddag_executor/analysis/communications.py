@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 from mddag_executor.analysis.spread import spread_of, sum_of
-from mddag_executor.recording.tables import different, Recording, rows_by
+from mddag_executor.recording.joins import different, rows_by
+from mddag_executor.recording.recording import Recording
 from mddag_executor.results.replays import Communication, RecordedCallback
 import numpy as np
 
@@ -18,7 +19,7 @@ def recorded_callbacks(recording: Recording) -> dict[str, RecordedCallback]:
     for number, mine in zip(numbers.tolist(), rows_by(index, len(numbers))):
         ended = mine[end[mine] >= 0]
         took = end[ended] - start[ended]
-        found[recording.who.name(number), number] = {
+        found[recording.names.name(number), number] = {
             'executions': len(took), 'unfinished': len(mine) - len(took),
             'busy_ns': sum_of(took), 'shortest_ns': int(took.min()) if len(took) else 0,
             'longest_ns': max(0, int(took.max(initial=0)))}
@@ -41,10 +42,10 @@ def communications(recording: Recording) -> list[Communication]:
         messages['publisher'], return_counts=True))))
     for mine in sorted(rows_by(which, len(pairs)), key=lambda each: int(each[0])):
         number = int(message['publisher'][mine[0]])
-        publisher = recording.who.every_publisher[number]
+        publisher = recording.names.publishers[number]
         found.append({
             'topic': publisher.topic,
             'publisher': publisher.node.name if publisher.node is not None else None,
-            'callback': recording.who.name(int(table['callback'][started[mine[0]]])),
+            'callback': recording.names.name(int(table['callback'][started[mine[0]]])),
             'sent': sent[number], 'arrived': len(mine), 'latency_ns': spread_of(latency[mine])})
     return sorted(found, key=lambda each: (each['topic'], each['callback']))

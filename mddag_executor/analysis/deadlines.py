@@ -58,16 +58,10 @@ from mddag_executor.core.state import (
 from mddag_executor.core.tables import DRIVEN
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
-from mddag_executor.recording.columns import concatenate, rows, Table
-from mddag_executor.recording.tables import (
-    different,
-    Ints,
-    Jobs,
-    Mask,
-    Recording,
-    rows_by,
-    sort_by,
-)
+from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
+from mddag_executor.recording.jobs import Jobs
+from mddag_executor.recording.joins import different, rows_by, sort_by
+from mddag_executor.recording.recording import Recording
 from mddag_executor.text import counted
 from msg_graph.model import optional_edges, topological_order
 import numpy as np
@@ -133,7 +127,7 @@ class Judged:
         ends = [recording.job_ends[mine] for mine in rows_by(
             recording.job_ends['dag'], len(task_set.dags))]
         completions = _completions(recording.executions, len(task_set.dags), np.array([
-            bool(recording.links or driven & DRIVEN) for driven in self.tables.driven]))
+            bool(recording.run.links or driven & DRIVEN) for driven in self.tables.driven]))
         self.jobs: list[JudgedJobs] = []
         found: list[Table] = []
         for dag in range(len(task_set.dags)):
@@ -164,7 +158,8 @@ class Judged:
         jobs = JudgedJobs(
             dag, every, number, release, released,
             np.full((len(released), last - first), -1, dtype=np.int32),
-            np.full(len(released), NEVER), np.full(len(released), self._recording.judged_until))
+            np.full(len(released), NEVER),
+            np.full(len(released), self._recording.run.judged_until))
         reason = self._given_up(jobs, ends)
         expected = self._expected(dag, jobs)
         # by job and vertex the position at which it completed
@@ -200,10 +195,11 @@ class Judged:
         # no sinks here, or not the last completion but a drop closed the job
         closed[(closed < 0) | (reason == recorded.OUTDATED)] = NEVER
         ended = np.minimum(jobs.ended, closed)
-        judged_order, judged_until = self._recording.judged_order, self._recording.judged_until
+        run = self._recording.run
+        judged_order, judged_until = run.judged_order, run.judged_until
         open_then = (jobs.released < judged_order) & (ended > judged_order)
         overdue = here & ~dropped & (ended_at > judged_order) & open_then[:, None] & (
-            deadline <= judged_until) if self._recording.judged else np.zeros_like(done)
+            deadline <= judged_until) if self._recording.run.judged else np.zeros_like(done)
         given_up = here & ~done & ~dropped & ~not_due & (jobs.ended < NEVER)[:, None] & (
             reason != recorded.WITHDRAWN)[:, None]
         self.contradictions += int((duplicates[0] < ended[duplicates[1]]).sum())
@@ -237,9 +233,9 @@ class Judged:
         recording = self._recording
         dropped = np.zeros((len(jobs.number), len(sinks)), dtype=np.bool_)
         when = np.zeros(dropped.shape, dtype=np.int64)
-        if 'newer' in recording.drop_reasons:
+        if 'newer' in recording.names.drop_reasons:
             drops = recording.drops
-            drops = drops[drops['reason'] == [*recording.drop_reasons].index('newer')]
+            drops = drops[drops['reason'] == [*recording.names.drop_reasons].index('newer')]
             for place, sink in enumerate(sinks):
                 mine = drops[drops['vertex'] == sink]
                 row = jobs.rows_of(mine['job'])
@@ -299,7 +295,7 @@ class Judged:
             for after, topic in optional_edges(vertex, vertices):
                 silent = self._is_silent(first + v, first + after, topic, jobs)
                 done, driven = jobs.done[:, v], self.tables.driven[first + v]
-                if driven & DRIVEN and self._recording.who.every_publisher:
+                if driven & DRIVEN and self._recording.names.publishers:
                     silent = ~np.isin(done, self._published.get((first + v, topic), _NO_ROWS))
                 elif driven:    # it may have completed with an execution of another job
                     of = jobs.rows_of(self._recording.executions['job'][done])
@@ -313,13 +309,13 @@ class Judged:
     def _is_silent(self, vertex: int, after: int, topic: str, jobs: JudgedJobs) -> Mask:
         """Return by job whether a vertex did not publish a topic that starts another vertex."""
         recording = self._recording
-        if recording.who.every_publisher:
+        if recording.names.publishers:
             by = self._published.get((vertex, topic), _NO_ROWS)
             row = jobs.rows_of(recording.executions['job'][by])
             silent = np.ones(len(jobs.number), dtype=np.bool_)
             silent[row[row >= 0]] = False
         else:   # a computed run records no publications, but what was not sent
-            row = jobs.rows_of(recording.unsent.get((vertex, after), _NO_ROWS))
+            row = jobs.rows_of(recording.run.unsent.get((vertex, after), _NO_ROWS))
             silent = np.zeros(len(jobs.number), dtype=np.bool_)
             silent[row[row >= 0]] = True
         return silent
@@ -328,7 +324,7 @@ class Judged:
     def _published(self) -> dict[tuple[int, str], Ints]:
         """Return by vertex and topic of ``may_publish`` the executions that published it."""
         topics = sorted({t for each in self.task_set.callbacks for t in each.may_publish})
-        publishers = self._recording.who.every_publisher
+        publishers = self._recording.names.publishers
         sent, ran = self._recording.publications, self._recording.executions
         found: dict[tuple[int, str], Ints] = {}
         for topic in topics:
@@ -355,7 +351,7 @@ class Judged:
 
     def _late_ends(self, jobs: JudgedJobs, ends: Table, ended: Ints) -> None:
         """Count ends of jobs that had ended already."""
-        if not self._recording.same:
+        if not self._recording.run.same:
             return
         ends = ends[ends['reason'] <= recorded.ABORTED]
         row = jobs.rows_of(ends['job'])
@@ -365,7 +361,7 @@ class Judged:
 
     def _expected(self, dag: int, jobs: JudgedJobs) -> Ints | None:
         """Return by job and vertex whether it is expected; None: all are expected (rule 6)."""
-        changes = [(order, vertices) for order, of, vertices in self._recording.hosted
+        changes = [(order, vertices) for order, of, vertices in self._recording.run.hosted
                    if of == dag]
         if not changes:
             return None
@@ -402,7 +398,7 @@ class Judged:
             row, order, vertex, completing = (
                 each[known] for each in (row, order, vertex, completing))
         n_legs = np.array(self.tables.n_legs[first:first + jobs.done.shape[1]])
-        single = (n_legs[vertex] == 1) | self._recording.links
+        single = (n_legs[vertex] == 1) | self._recording.run.links
         # the first completion of each vertex wins: it is written last
         places, orders = jobs.done.reshape(-1), position.reshape(-1)
         cell = row * jobs.done.shape[1] + vertex
@@ -451,7 +447,7 @@ class Judged:
 
     def _is_judged(self, release: Ints) -> Mask:
         """Return which releases are judged (rule 4)."""
-        begin, end = self._recording.judged_releases or (-NEVER, NEVER)
+        begin, end = self._recording.run.judged_releases or (-NEVER, NEVER)
         judged: Mask = (release >= max(begin, self.judge_from)) & (release < end)
         return judged
 
@@ -491,7 +487,7 @@ class Judged:
         Only meaningful if the end of the run is recorded: otherwise the trace may end between a
         completion and its verdict.
         """
-        if self.skip or not self._recording.same:
+        if self.skip or not self._recording.run.same:
             return None  # the recorded sums count all jobs
         missed, before = self.missed, self._recording.misses
         columns = ('dag', 'sink', 'job', 'deadline', 'completed')
@@ -537,7 +533,7 @@ def _completions(executions: Table, n_dags: int, whole: Mask) -> list[Ints]:
 
 def _judge_from(recording: Recording, skip: int) -> int:
     """Return the first release that is judged after a warm-up."""
-    begin, releases = recording.judge_from, recording.releases
+    begin, releases = recording.run.judge_from, recording.releases
     if begin > -NEVER:
         return begin + skip
     if skip > 0 and len(releases):

@@ -29,21 +29,13 @@ from typing import NamedTuple
 
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
-from mddag_executor.recording.entities import Callback, KINDS
-from mddag_executor.recording.head import is_declared
+from mddag_executor.recording.columns import Ints, Mask
+from mddag_executor.recording.joins import different, rows_by, sort_by
 from mddag_executor.recording.mapping import declared_keys
-from mddag_executor.recording.tables import (
-    different,
-    Ints,
-    Mask,
-    Recording,
-    rows_by,
-    sort_by,
-    VERTEX,
-)
-from mddag_executor.sources.head import named_errors, read_head
-from mddag_executor.sources.open import open_recording
-from mddag_executor.trace import TraceReader
+from mddag_executor.recording.names import Callback, KINDS
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import VERTEX
+from mddag_executor.sources.open import open_to_draft
 from msg_graph import Callback as Declared
 from msg_graph import EMPTY_TASK_SET, ExecutionTime, TaskSet
 from msg_graph.binding import function_of, is_background
@@ -102,20 +94,17 @@ class System:
         progress: Callable[[int], None] | None = None,
     ) -> None:
         self.name = name or os.fspath(path)
-        with named_errors(os.fspath(path), self.name):
-            reader = TraceReader(path)
-            head = read_head(reader)
-            graph = None if head is None or is_declared(head) else EMPTY_TASK_SET
-            recording = open_recording(reader, graph, self.name, progress)
-        declared = recording.declared
+        recording = open_to_draft(path, self.name, progress)
+        declared = recording.run.declared
         self.task_set: TaskSet | None = recording.task_set if declared else None
-        self.workers: int | None = recording.head.workers if declared else None
-        self.warnings = list(reader.warnings)
-        self._process_names = recording.process_names
-        self._who = recording.who
+        self.workers: int | None = recording.run.head.workers if declared else None
+        self.warnings = [
+            loss.text for loss in recording.missing if loss.kind == 'damage']
+        self._process_names = recording.names.processes
+        self._names = recording.names
         self._end = recording.end
         self._entities = [entity for entity in sorted(
-            self._who.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
+            self._names.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
         if not self._entities:
             raise InputError(
                 self.name, 'no timer, subscription or service of a node is recorded in it',
@@ -126,9 +115,9 @@ class System:
             number: recording.task_set.vertices[vertex].callback for number, vertex in zip(
                 numbers.tolist(), recording.vertices_of_callbacks().tolist()) if vertex >= 0}
         # those of the other topics of a driven sync run as no vertex
-        for number, key in declared_keys(self._who, recording.recorded_set).items():
+        for number, key in declared_keys(self._names, recording.run.recorded_set).items():
             if number not in self._declared and (
-                    callback := recording.recorded_set.callback(key)).driven_by is not None:
+                    callback := recording.run.recorded_set.callback(key)).driven_by is not None:
                 self._declared[number] = callback
         self._runs = {number: _runs_of(recording, chosen) for number, chosen in zip(
             numbers.tolist(), rows_by(index, len(numbers)))}
@@ -138,8 +127,8 @@ class System:
         """Find the topics of callbacks and nodes."""
         #: By node its published topics, and whether a callback was seen to publish them.
         self._publishers: dict[str, dict[str, bool]] = {
-            name: {} for name in self._who.names_of_nodes}
-        publishers = self._who.every_publisher
+            name: {} for name in self._names.nodes}
+        publishers = self._names.publishers
         for publisher in publishers.values():
             if publisher.node is not None:
                 self._publishers[publisher.node.name][publisher.topic] = False
@@ -164,7 +153,7 @@ class System:
         """Find the header stamps of messages, by node and topic, and by topic."""
         self._sent_headers: dict[tuple[str, str], Ints] = {}
         self._headers: dict[str, list[Ints]] = {}
-        sent, publishers = recording.publications, self._who.every_publisher
+        sent, publishers = recording.publications, self._names.publishers
         numbers, which = different(sent['publisher'])
         for number, mine in zip(numbers.tolist(), rows_by(which, len(numbers))):
             publisher, stamps = publishers.get(number), sent['header_stamp'][mine]

@@ -15,8 +15,10 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Set
 
+from mddag_executor.recording.joins import different, rows_by
 from mddag_executor.recording.mapping import declared_keys
-from mddag_executor.recording.tables import different, Recording, rows_by, VERTEX
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import VERTEX
 from msg_graph.drift import Drift, drift, Observed, Releases
 import numpy as np
 
@@ -27,10 +29,10 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
 
     :param skip: warm-up time after the first release that does not count for rates, ns.
     """
-    judge, who, table = recording.task_set, recording.who, recording.executions
+    judge, names, table = recording.task_set, recording.names, recording.executions
     vertices = judge.vertices
-    keys = declared_keys(who, recording.recorded_set)
-    periods = {key: each.period for each in who.made if each.kind == 'timer'
+    keys = declared_keys(names, recording.run.recorded_set)
+    periods = {key: each.period for each in names.made if each.kind == 'timer'
                and each.period > 0 and (key := keys.get(each.number)) is not None}
     releases: dict[str, Releases] = {}
     released, since = recording.releases, (recording.start or 0) + skip
@@ -43,7 +45,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             of.add(int(mine.min()))
             of.add(int(mine.max()))
             of.count = len(mine)
-            if not recording.declared and key in periods:   # skipped releases are no jobs there
+            if not recording.run.declared and key in periods:  # skipped releases are no jobs
                 skipped = np.rint(np.diff(np.sort(mine)) / periods[key]) - 1
                 of.count += int(skipped[skipped > 0].sum())
     # declared callbacks that were started, and other executions, a coroutine's once each
@@ -69,7 +71,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         ran[key] += late_counts.get(callback, 0) or min(1, counts.get(callback, 0))
         got[key] += late_got.get(callback, 0)
     came: defaultdict[str, Set[str]] = defaultdict(set)
-    for each in who.made:
+    for each in names.made:
         if counts.get(each.number) and each.number in keys:
             came[keys[each.number]] |= {each.start}
     whole = table['vertex'][declared & (table['completes'] == VERTEX)]
@@ -84,12 +86,12 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     for pair in pairs.tolist():
         number = int(publishers[pair // len(numbers)])
         callback = int(numbers[pair % len(numbers)])
-        publisher = who.every_publisher.get(number)
+        publisher = names.publishers.get(number)
         if callback in keys and publisher is not None and publisher.node is not None:
             publishes[keys[callback]] |= {publisher.topic}
-    bound = declared_keys(who, judge)
+    bound = declared_keys(names, judge)
     return drift(judge, Observed(
-        max(0, recording.end - recording.begin), releases,
-        dict(got), dict(ran), came, publishes, set(who.names_of_nodes) or None,
-        [each.entity for each in who.made
+        max(0, recording.end - recording.run.begin), releases,
+        dict(got), dict(ran), came, publishes, set(names.nodes) or None,
+        [each.entity for each in names.made
          if each.entity is not None and each.number not in bound], periods))

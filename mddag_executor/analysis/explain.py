@@ -44,8 +44,10 @@ from mddag_executor.core.policies import SIMULATED_ONLY
 from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.columns import concatenate, in_parts, rows, Table
-from mddag_executor.recording.tables import different, Ints, Mask, Recording, rows_by, VERTEX
+from mddag_executor.recording.columns import concatenate, in_parts, Ints, Mask, rows, Table
+from mddag_executor.recording.joins import different, rows_by
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import VERTEX
 from mddag_executor.results.replays import (
     ExplainResult,
     ExplainResultRare,
@@ -68,16 +70,17 @@ class Explanation:
 
     def __init__(self, recording: Recording, judged: Judged, chains: Chains) -> None:
         self._recording, self._task_set = recording, recording.task_set
-        self._tables, self._who = judged.tables, recording.who
+        self._tables, self._who = judged.tables, recording.names
         # without misses there is nothing to explain
         self._executions = recording.executions[:None if len(judged.missed) else 0]
         self._rows = ran(self._executions)
         # with several processes it is unknown whose workers were busy
-        self._workers = recording.head.workers if recording.declared and \
-            recording.processes == 1 and recording.head.policy not in SIMULATED_ONLY else 0
+        run = recording.run
+        self._workers = run.head.workers if run.declared and run.processes == 1 and \
+            run.head.policy not in SIMULATED_ONLY else 0
         # where callbacks may delay each other: of another executor it is not known which threads
         # share its work
-        self._place = self._executions['worker' if recording.imported else 'process'].astype(
+        self._place = self._executions['worker' if run.imported else 'process'].astype(
             np.int64)
         #: Begin and end of each stop of the machine.
         self.stops = self._stops()
@@ -137,13 +140,14 @@ class Explanation:
         first = int(min(table['start'][rows].min(initial=_NO_END),
                         missed['release'].min(initial=_NO_END)))
         # by vertex the place of its last execution
-        one = not self._recording.imported and self._recording.processes == 1
+        one = not self._recording.run.imported and self._recording.run.processes == 1
         of_vertex = np.full(len(self._task_set.vertices) + 1, 0 if one else -1)
         of_vertex[table['vertex'][rows]] = self._place[rows]
         threads = {
             thread: Spans(*crowded(table['start'][each], table['end'][each], 1))
             for thread in np.unique(self._place[rows]).tolist()
-            for each in [rows[self._place[rows] == thread]]} if self._recording.imported else None
+            for each in [rows[self._place[rows] == thread]]
+        } if self._recording.run.imported else None
         return Pool(
             Spans(*crowded(start, end, max(1, self._workers))),
             Spans(*(crowded(since, until, 1) if len(holding) else crowded(start, end, 1))),
@@ -211,7 +215,7 @@ class Explanation:
 
     def _dropped(self) -> tuple[dict[tuple[int, int], tuple[str, int]], dict[int, Ints]]:
         """Return why and when executions were dropped, by vertex and job; and without a job."""
-        drops, reasons = self._recording.drops, self._recording.drop_reasons
+        drops, reasons = self._recording.drops, self._recording.names.drop_reasons
         place = np.array([*self._task_set.places_of_vertices(), -1])
         without = drops[(drops['job'] < 0) & (drops['vertex'] >= 0)]
         of = place[without['vertex']]
@@ -227,7 +231,7 @@ class Explanation:
         The callback before completed in this job and did not publish the topic.
         """
         recording, table = self._recording, self._executions
-        if not recording.who.every_publisher:
+        if not recording.names.publishers:
             return set()    # a simulated run: its callbacks always publish
         wanted = {(vertex, job) for vertex, job in zip(
             missed['at'].tolist(), missed['job'].tolist())}
@@ -242,7 +246,7 @@ class Explanation:
         for vertex, job, number in zip(*(
                 table[name][sent['execution']].tolist() for name in ('vertex', 'job')),
                 sent['publisher'].tolist()):
-            publisher = recording.who.every_publisher.get(number)
+            publisher = recording.names.publishers.get(number)
             published[vertex, job].add('' if publisher is None else publisher.topic)
         return {(vertex, job) for vertex, job in wanted for publisher, topic in legs[vertex]
                 if (publisher, job) in completed and topic not in published[publisher, job]
@@ -264,7 +268,7 @@ class Explanation:
         dropped = {
             (self._tables.dag_of[vertex], job): (vertex, time)
             for _, vertex, job, time, reason in recording.drops.tolist()
-            if recording.drop_reasons[reason] in ('aborted', 'newer')
+            if recording.names.drop_reasons[reason] in ('aborted', 'newer')
             and not self._task_set.vertices[vertex].predecessors}
         if not dropped:
             return started

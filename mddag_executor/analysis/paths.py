@@ -52,22 +52,23 @@ documentation of its response time cases.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast, NamedTuple
 
 from mddag_executor.analysis.spread import spread
-from mddag_executor.recording.columns import concatenate, rows, Table
-from mddag_executor.recording.tables import (
+from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
+from mddag_executor.recording.joins import (
+    as_of,
     different,
-    EXECUTIONS,
-    Ints,
+    equal,
+    last_before,
     last_of,
     later_pieces,
-    look_up,
-    Mask,
-    Recording,
     rows_by,
     sort_by,
 )
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import EXECUTIONS
 from mddag_executor.results.replays import PathResult, PathTimes, ResponseCases
 from msg_graph import Callback, Path
 from msg_graph.segments import hops, may_end
@@ -167,8 +168,8 @@ class Paths:
             table = rows(EXECUTIONS, 1, vertex=NONE, start=NONE, end=NONE)
         self._table = table
         self._vertex = table['vertex']
-        if recording.callback_vertex:
-            self._add_vertices(recording.callback_vertex)
+        if recording.names.vertices:
+            self._add_vertices(recording.names.vertices)
         # by the index of a callback the rows of its executions
         place = np.where(self._vertex >= 0, self._place[self._vertex], NONE)
         self._of_place = [
@@ -176,25 +177,25 @@ class Paths:
         self._later = later_pieces(table)
         # by topic its publications, if they are recorded, and by publication the index of its node
         self._of_topic: list[Ints] | None = None
-        if recording.who.every_publisher or recording.links:
+        if recording.names.publishers or recording.run.links:
             self._published()
         # messages that running callbacks took themselves, by execution
         self._took = self._first(recording.takes['execution']), recording.takes['message']
 
-    def _add_vertices(self, of: dict[int, int]) -> None:
+    def _add_vertices(self, of: Mapping[int, int]) -> None:
         """Find the declared callbacks of executions without job."""
         self._vertex = self._vertex.copy()
         callbacks = np.array(sorted(of), dtype=np.int64)
         unknown = np.flatnonzero(self._vertex < 0)
         callback = self._recording.executions['callback'][unknown]
-        at = look_up(callbacks, callback)
+        at = equal(callbacks, callback)
         known = at >= 0
         self._vertex[unknown[known]] = np.array(
             [of[each] for each in callbacks.tolist()])[at[known]]
 
     def _published(self) -> None:
         """Find the recorded publications on the topics of paths."""
-        publishers = self._recording.who.every_publisher
+        publishers = self._recording.names.publishers
         numbers, which = different(self._recording.publications['publisher'])
         known = [publishers.get(number) for number in numbers.tolist()]
         topics, nodes = np.array(
@@ -223,7 +224,7 @@ class Paths:
         """Return in which executions a callback of a computed run published a topic."""
         sent = np.ones(len(ended.rows), dtype=np.bool_)
         vertex, vertices = self._vertex[ended.rows], self._task_set.vertices
-        for (before, after), jobs in self._recording.unsent.items():
+        for (before, after), jobs in self._recording.run.unsent.items():
             if vertices[before].callback is callback and any(
                     self._topics.get(t) == topic for t in vertices[after].callback.topics):
                 sent &= (vertex != before) | ~np.isin(ended.job, jobs)
@@ -237,7 +238,7 @@ class Paths:
             vertex >= 0, self._place[vertex] == self._places[callback.key],
             self._node[mine] == self._nodes[callback.node])]
         by, known = sent['execution'][mine], sent['vertex'][mine] >= 0
-        message = mine if self._recording.links else np.where(
+        message = mine if self._recording.run.links else np.where(
             (by >= 0) & known, self._message(table['job'][by], table['vertex'][by], topic), NONE)
         return rows(_SENT, len(mine), known=known, message=message, time=sent['time'][mine],
                     run=self._first(by))
@@ -247,7 +248,7 @@ class Paths:
         later, first = self._later
         if not len(later):
             return rows
-        at = look_up(later, rows)
+        at = equal(later, rows)
         return np.where(at >= 0, np.append(first, NONE)[at], rows)
 
     def _message(self, job: Any, vertex: Any, topic: Any) -> Ints:
@@ -268,7 +269,7 @@ class Paths:
             topics = np.full(len(mine), NONE)
         else:
             numbers, which = different(table['callback'][mine])
-            names = [self._recording.who.topic(number) for number in numbers.tolist()]
+            names = [self._recording.names.topic(number) for number in numbers.tolist()]
             topics = np.array([self._topics.get(name, -2) if name else NONE
                                for name in names], dtype=np.int64)[which]
         return Executions(
@@ -311,7 +312,7 @@ class Paths:
                     parent = timeline.as_of(ran.start)
             if hop is not None and hop.kind == 'topic':
                 taker, taken = self._took
-                at = look_up(ran.runs, taker)
+                at = equal(ran.runs, taker)
                 mine = at != NONE
                 parent[at[mine]] = _as_of_each(
                     messages, taken[mine], np.full(int(mine.sum()), _NEVER))
@@ -330,7 +331,7 @@ class Paths:
 
     def _messages_for(self, before: str, ran: Executions) -> list[Ints]:
         """Return the messages that may have started executions; later entries have priority."""
-        if self._recording.links:
+        if self._recording.run.links:
             return [self._table['message'][ran.runs]]
         found: list[Ints] = []
         vertices = self._task_set.vertices
@@ -408,7 +409,7 @@ class _Timeline(NamedTuple):
         """Return the last steps at given times, or ``before`` them."""
         if not len(self.times):
             return np.full(len(times), NONE)
-        at = np.searchsorted(self.times, times, 'left' if before else 'right') - 1
+        at = (last_before if before else as_of)(self.times, times)
         found: Ints = np.where(at >= 0, self.steps[at], NONE)
         return found
 

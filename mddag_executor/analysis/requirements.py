@@ -15,8 +15,9 @@ from mddag_executor.analysis.paths import Flows, NONE, Paths
 from mddag_executor.core import NEVER
 from mddag_executor.core.requirements import RequirementTally, Rules
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_NOT_DUE
-from mddag_executor.recording.columns import concatenate, rows, Table
-from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by
+from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
+from mddag_executor.recording.joins import sort_by
+from mddag_executor.recording.recording import Recording
 from mddag_executor.results.replays import LatePart, LatePath
 from mddag_executor.results.sinks import Requirements as Results
 from msg_graph import Path
@@ -40,13 +41,13 @@ class Requirements:
     """
 
     def __init__(self, recording: Recording, paths: Paths, judge_from: int = -NEVER) -> None:
-        begin, end = recording.judged_releases or (-NEVER, NEVER)
+        begin, end = recording.run.judged_releases or (-NEVER, NEVER)
         self._from, self._to = max(begin, judge_from), end
         if recording.whole is not None:     # a part lacks what answers its last inputs
             recording = recording.whole
             paths = Paths(recording)
         self._recording, self._paths = recording, paths
-        self._until = recording.judged_until
+        self._until = recording.run.judged_until
 
     @property
     def paths(self) -> list[Path]:
@@ -95,7 +96,7 @@ class Requirements:
             answer, not_due, best = answer[1:], not_due[1:], best[1:]
         answered = ~not_due & (answer < NEVER)
         overdue = ~not_due & ~answered & (since + required <= self._until) if (
-            self._recording.judged) else np.zeros(len(since), dtype=np.bool_)
+            self._recording.run.judged) else np.zeros(len(since), dtype=np.bool_)
         kind = np.select(
             [not_due, overdue, answer - since > required], [SINK_NOT_DUE, SINK_MISSED, SINK_LATE],
             SINK_IN_TIME)
@@ -117,7 +118,7 @@ class Requirements:
                      step=flows.step[newest], count=1)[self._is_judged(since)]
         begins = flows.begin[flows.begin != NONE]
         begins = begins[self._is_judged(begins)]
-        if not len(begins) or not self._recording.judged:
+        if not len(begins) or not self._recording.run.judged:
             return found
         last = int(found['end'].max(initial=begins.min()))
         missing = rules.missing_outputs(last, min(self._until, self._to), required)

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, Protocol, TYPE_CHECKING
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.columns import Table
 from mddag_executor.recording.frames import arrow_of, named, numbers
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.recording import Recording
 import numpy as np
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class ResultTable(NamedTuple):
     def to_arrow(self, replay: Replayed) -> Any:
         """Return it as an Arrow table, with names instead of numbers."""
         table = self.table(replay)
-        return arrow_of(replay.recording, {
+        return arrow_of(replay.recording.name, {
             name: (_array(replay.recording, column, table[name]), column.unit)
             for name, column in self.columns.items()})
 

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from mddag_executor.recording.tables import Ints
+from mddag_executor.recording.columns import Ints
 import numpy as np
 
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from mddag_executor.core import quantile
-from mddag_executor.recording.tables import Ints
+from mddag_executor.recording.columns import Ints
 from mddag_executor.results.replays import Spread
 import numpy as np
 

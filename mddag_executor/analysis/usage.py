@@ -20,18 +20,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 from mddag_executor.analysis.spans import Spans
-from mddag_executor.recording.columns import in_parts, Table
+from mddag_executor.recording.columns import in_parts, Ints, Table
 from mddag_executor.recording.columns import rows as table_of
-from mddag_executor.recording.tables import (
-    different,
-    Ints,
-    later_pieces,
-    NOTHING,
-    Recording,
-    rows_by,
-    sort_by,
-    UNKNOWN,
-)
+from mddag_executor.recording.joins import different, later_pieces, rows_by, sort_by
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import NOTHING, UNKNOWN
 from mddag_executor.results.replays import CallbackUse, OverTime, WorkerUse
 import numpy as np
 
@@ -60,7 +53,7 @@ def in_groups(recording: Recording) -> Iterator[tuple[int, Ints, Ints, Ints]]:
 
     They are in the order of ends; open ones come last, and end with the recording.
     """
-    table, known = recording.executions, recording.who.groups
+    table, known = recording.executions, recording.names.groups
     if max(known.values(), default=UNKNOWN) < 0:
         return
     rows = np.r_[ran(table), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]

@@ -19,6 +19,10 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
+Ints = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+Places = npt.NDArray[np.int32]
+
 _PART = 1 << 16
 """Rows of a part of a table."""
 
@@ -115,6 +119,11 @@ class Table:
         for name, column in self._columns.items():
             found[name] = column
         return found
+
+    def freeze(self) -> None:
+        """Let no column be written any more."""
+        for column in self._columns.values():
+            column.flags.writeable = False
 
     def copy(self) -> Table:
         """Return a table with copies of the columns."""

@@ -18,45 +18,30 @@ Theory of operation
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from mddag_executor.recording.head import ReplayError
-from mddag_executor.recording.tables import (
-    Mask,
-    Recording,
-    RowNumbers,
-    VERTEX,
-)
+from mddag_executor.recording.columns import Mask, Places
+from mddag_executor.recording.jobs import Jobs
+from mddag_executor.recording.joins import RowNumbers
+from mddag_executor.recording.run import Run
+from mddag_executor.recording.tables import Columns, VERTEX
 from msg_graph.model import topological_order
 import numpy as np
 
 
-def cut(recording: Recording, begin: int, end: int) -> Recording:
+def part(
+    columns: Columns, run: Run, jobs: Jobs, job_of: Places, begin: int, end: int
+) -> tuple[Columns, int]:
     """
-    Return a time range of a recording.
+    Return the tables of a time range, and when this part ends.
 
-    :param begin: begin of the range, ns after the start of the recording; ``end``: likewise.
-    :raises ValueError: if the range is empty or begins before the recording.
-    :raises mddag_executor.ReplayError: if it begins after the recording.
+    :param job_of: by execution the place of its job; ``begin``, ``end``: of the range, ns.
     """
-    if not 0 <= begin < end:
-        raise ValueError(f'from {begin} to {end} ns is no range of time')
-    if recording.start is None:     # empty recording
-        return recording
-    length = recording.end - recording.start
-    if begin > length:
-        raise ReplayError(
-            recording.name, f'it ends {length / 1e9:.3f} s after its first release',
-            'give an earlier time')
-    begin, end = recording.start + begin, recording.start + end
-    table, released = recording.executions, recording.releases
-    jobs, job_of = recording.jobs, recording.job_places
+    table, released = columns.executions, columns.releases
     in_range = (released['release'] >= begin) & (released['release'] < end)
     judged = jobs.marked(in_range)
-    own = judged[job_of] | _followed(recording, end)
-    ends = recording.job_ends
+    own = judged[job_of] | _followed(columns, run, end)
+    ends = columns.job_ends
     until = max(
-        min(end, recording.end), *(int(times.max(initial=begin)) for times in (
+        min(end, run.end), *(int(times.max(initial=begin)) for times in (
             table['end'][own], ends['time'][judged[jobs.places(ends)]])))
     last = max(until, end)      # undeclared callbacks may run after the end of the recording
 
@@ -66,45 +51,44 @@ def cut(recording: Recording, begin: int, end: int) -> Recording:
     seen = judged | jobs.marked((released['release'] >= begin) & (released['release'] < last))
     seen[job_of[kept]] = True
     seen[-1] = False
-    sent, takes = recording.publications, recording.takes
+    sent, takes = columns.publications, columns.takes
     executions = RowNumbers(kept)
     of_kept = executions.has(sent['execution']) | (
         (sent['execution'] < 0) & (sent['time'] >= begin) & (sent['time'] < last))
     takes = takes[executions.has(takes['execution'])]
-    for message in (table['message'][kept] if recording.links else table['message'][:0],
+    for message in (table['message'][kept] if run.links else table['message'][:0],
                     takes['message']):
         of_kept[message[message >= 0]] = True
     messages = RowNumbers(of_kept)
     table, sent = table[kept], sent[of_kept]
     sent['execution'] = executions.new(sent['execution'])
-    if recording.links:
+    if run.links:
         table['message'] = messages.new(table['message'])
     takes['execution'] = executions.new(takes['execution'])
     takes['message'] = messages.new(takes['message'])
-    stops, drops, demotions = recording.stops, recording.drops, recording.demotions
-    losses = recording.losses
-    return replace(
-        recording, releases=released[seen[jobs.places(released)]], executions=table,
+    stops, drops, demotions = columns.stops, columns.drops, columns.demotions
+    losses = columns.losses
+    return Columns(
+        releases=released[seen[jobs.places(released)]], executions=table,
         publications=sent, takes=takes, job_ends=ends[seen[jobs.places(ends)]],
         stops=stops[(stops['start'] < last) & (stops['end'] > begin)],
         drops=drops[(drops['time'] >= begin) & (drops['time'] < last)],
         losses=losses[(losses['time'] >= begin) & (losses['time'] < last)],
         demotions=demotions[(demotions['time'] >= begin) & (demotions['time'] < last)],
-        misses=recording.misses[judged[jobs.places(recording.misses)]],
-        start=begin, end=until, judged_releases=(begin, end), whole=recording.whole or recording)
+        misses=columns.misses[judged[jobs.places(columns.misses)]]), until
 
 
-def _followed(recording: Recording, end: int) -> Mask:
+def _followed(columns: Columns, run: Run, end: int) -> Mask:
     """
     Return which executions later jobs may complete those of the range with (``driven_by``).
 
     Those are the executions of the first jobs after the range in which a driven sync, or a vertex
     after it, has completed.
     """
-    table, released = recording.executions, recording.releases
+    table, released = columns.executions, columns.releases
     found = np.zeros(len(table), dtype=np.bool_)
     first = 0
-    for dag in recording.task_set.dags:
+    for dag in run.task_set.dags:
         after: set[int] = set()
         for v in topological_order(dag):
             vertex = dag.vertices[v]

@@ -10,10 +10,10 @@ version of the tables (``mddag.tables``), which changes when the meaning of a co
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
-from mddag_executor.recording.tables import REASONS, Recording, TABLES, UNKNOWN
+from mddag_executor.recording.tables import Columns, REASONS, TABLES, UNKNOWN
 import numpy as np
 
 VERSION = '1'
@@ -25,17 +25,31 @@ _COMPLETES = 'nothing', 'leg', 'vertex'
 _INNER = {'order'}
 
 
-def arrow_table(recording: Recording, name: str) -> Any:
-    """Return a table of a recording, one of ``TABLES`` (else KeyError), as an Arrow table."""
+class Words(NamedTuple):
+    """The names of numbers in tables."""
+
+    dags: Sequence[str]
+    vertices: Sequence[str]
+    drop_reasons: Sequence[str]
+    callback: Callable[[int], str]
+    publisher: Callable[[int], str]
+
+
+def arrow_table(columns: Columns, name: str, recording: str, words: Words) -> Any:
+    """
+    Return a table of a recording, one of ``TABLES`` (else KeyError), as an Arrow table.
+
+    :param recording: the name of the recording.
+    """
     if name not in TABLES:
         raise KeyError(f'there is no table {name!r}: the tables are {", ".join(TABLES)}')
-    kind, rows = TABLES[name], getattr(recording, name)
+    kind, rows = TABLES[name], getattr(columns, name)
     arrays = {}
     for column in kind.names or ():
         if column in _INNER:
             continue
         values = rows[column]
-        array = _names(recording, name, column, values)
+        array = _names(words, name, column, values)
         if array is None:
             has_unknown = values.dtype.kind == 'i' and column != 'leg'
             array = numbers(values, values != UNKNOWN if has_unknown else None)
@@ -43,27 +57,30 @@ def arrow_table(recording: Recording, name: str) -> Any:
     return arrow_of(recording, arrays)
 
 
-def arrow_of(recording: Recording, arrays: Mapping[str, tuple[Any, str]]) -> Any:
-    """Return an Arrow table from arrays by name, each with its unit or an empty text."""
+def arrow_of(recording: str, arrays: Mapping[str, tuple[Any, str]]) -> Any:
+    """
+    Return an Arrow table from arrays by name, each with its unit or an empty text.
+
+    :param recording: the name of the recording.
+    """
     import pyarrow
     fields = [pyarrow.field(name, array.type, metadata={'unit': unit} if unit else None)
               for name, (array, unit) in arrays.items()]
     return pyarrow.table([array for array, _ in arrays.values()], schema=pyarrow.schema(
-        fields, metadata={'mddag.tables': VERSION, 'mddag.recording': recording.name}))
+        fields, metadata={'mddag.tables': VERSION, 'mddag.recording': recording}))
 
 
-def _names(recording: Recording, table: str, column: str, values: Any) -> Any:
+def _names(words: Words, table: str, column: str, values: Any) -> Any:
     """Return the names of a column of numbers; None if its numbers have no names."""
-    task_set = recording.task_set
     if column in ('dag', 'vertex'):
-        names = [each.name for each in (
-            task_set.dags if column == 'dag' else task_set.vertices)]
+        names = list(words.dags if column == 'dag' else words.vertices)
         codes = values.astype(np.int32)
     elif column in ('callback', 'publisher'):
         addresses, codes = np.unique(values, return_inverse=True)
-        names = [_name(recording, column, each) for each in addresses.tolist()]
+        name = words.callback if column == 'callback' else words.publisher
+        names = [name(each) for each in addresses.tolist()]
     elif column == 'reason':
-        names = list(recording.drop_reasons if table == 'drops' else REASONS)
+        names = list(words.drop_reasons if table == 'drops' else REASONS)
         codes = values.astype(np.int32)
     elif column == 'completes':
         names, codes = list(_COMPLETES), values
@@ -102,18 +119,6 @@ def named(codes: Any, names: Sequence[str], known: Any = None) -> Any:
     return pyarrow.DictionaryArray.from_arrays(
         numbers(codes.astype(np.int32), known), pyarrow.StringArray.from_buffers(
             len(texts), pyarrow.py_buffer(ends), pyarrow.py_buffer(b''.join(texts))))
-
-
-def _name(recording: Recording, column: str, number: int) -> str:
-    if column == 'callback':
-        return recording.callback_name(number)
-    publisher = recording.who.every_publisher.get(number)
-    return 'unknown' if publisher is None else publisher.topic
-
-
-def pandas_frame(recording: Recording, name: str) -> Any:
-    """Return a table of a recording as a pandas data frame; see ``arrow_table``."""
-    return frame_of(arrow_table(recording, name))
 
 
 def frame_of(table: Any) -> Any:

@@ -35,9 +35,10 @@ from typing import NamedTuple
 
 from mddag_executor.core import legs_of
 from mddag_executor.recording.columns import Table
-from mddag_executor.recording.entities import Callback, Entities, Node
 from mddag_executor.recording.head import ReplayError
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.losses import Loss
+from mddag_executor.recording.names import Callback, Names, Node
+from mddag_executor.recording.recording import Recording
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
 from msg_graph import Dag, EMPTY_TASK_SET, TaskSet, Vertex
@@ -52,9 +53,10 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
     :param judge: None: the recorded one.
     :raises ReplayError: if the recording has none of its callbacks.
     """
-    recorded = recording.recorded_set
+    run, columns = recording.run, recording.columns
+    recorded = run.recorded_set
     if judge is None or judge.text == recorded.text:    # it judged the run itself
-        return replace(recording, task_set=judge or recorded)
+        return replace(recording, run=replace(run, task_set=judge or recorded))
     known, wanted = ([each.key for each in of.callbacks] for of in (recorded, judge))
     missing = report_missing(recording.name, judge, set(known), known, [
         each for callback in recorded.callbacks if callback.key not in wanted
@@ -62,9 +64,10 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
     dags, vertices, legs = _matches(recorded, judge)
     unreleased = [each.name for each in judge.dags if each.index not in dags]
     if unreleased:
-        missing.append(
+        missing.append(Loss(
+            'callbacks', len(unreleased),
             f'{judge.file}: {counted(len(unreleased), "DAG")} without jobs, because the '
-            f'source is no source in the recording: {listed(unreleased)}')
+            f'source is no source in the recording: {listed(unreleased)}'))
     dag, vertex = np.array([*dags, -1]), np.array([*vertices, -1])
     n_legs = max(map(len, legs), default=1)
     leg = np.array([[*each, *[-1] * (n_legs - len(each))] for each in [*legs, []]])
@@ -92,14 +95,14 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
         return table[table['dag'] >= 0]
 
     hosted = [(order, dags[of], frozenset(int(vertex[v]) for v in here) - {-1})
-              for order, of, here in recording.hosted if dags[of] >= 0]
+              for order, of, here in run.hosted if dags[of] >= 0]
     return replace(
-        recording, task_set=judge, same=False, warnings=[*recording.warnings, *missing],
-        hosted=hosted,
-        executions=moved(recording.executions), publications=moved(recording.publications),
-        drops=moved(recording.drops), demotions=moved(recording.demotions),
-        misses=moved(recording.misses),
-        releases=of_dags(recording.releases), job_ends=of_dags(recording.job_ends))
+        recording, run=replace(run, task_set=judge, same=False, hosted=hosted),
+        missing=recording.missing.more(*missing), columns=replace(
+            columns, executions=moved(columns.executions),
+            publications=moved(columns.publications), drops=moved(columns.drops),
+            demotions=moved(columns.demotions), misses=moved(columns.misses),
+            releases=of_dags(columns.releases), job_ends=of_dags(columns.job_ends)))
 
 
 def _matches(
@@ -149,7 +152,7 @@ def _legs(vertex: Vertex, dag: Dag, other: Vertex, target: Dag) -> list[int]:
 
 def report_missing(
     name: str, judge: TaskSet, found: Set[str], known: Sequence[str], others: Sequence[Entity]
-) -> list[str]:
+) -> list[Loss]:
     """
     Return the warning about declared callbacks that are not recorded, if any.
 
@@ -167,9 +170,10 @@ def report_missing(
         raise ReplayError(
             name, f'none of the callbacks of {judge.file} is in it: {has}',
             question or 'give the graph of the nodes that were recorded, or none')
-    return [f'{name}: not in it: {len(absent)} of the {len(judge.callbacks)} callbacks of '
-            f'{judge.file}, which count as never completed: {listed([c.key for c in absent])}'
-            + ('' if question is None else f': {question}')]
+    return [Loss('callbacks', len(absent), (
+        f'{name}: not in it: {len(absent)} of the {len(judge.callbacks)} callbacks of '
+        f'{judge.file}, which count as never completed: {listed([c.key for c in absent])}'
+        + ('' if question is None else f': {question}')))]
 
 
 class Target(NamedTuple):
@@ -180,22 +184,22 @@ class Target(NamedTuple):
     topic: str
 
 
-def nodes_of(who: Entities) -> list[list[Callback]]:
+def nodes_of(names: Names) -> list[list[Callback]]:
     """Return the timers, subscriptions and services of each node, in the order of creation."""
     found: dict[Node, list[Callback]] = {}
-    for each in sorted(who.made, key=lambda c: (c.made, c.number)):
+    for each in sorted(names.made, key=lambda c: (c.made, c.number)):
         if each.node is not None:
             found.setdefault(each.node, []).append(each)
     return list(found.values())
 
 
-def matches(who: Entities, declared: TaskSet) -> dict[int, Target]:
+def matches(names: Names, declared: TaskSet) -> dict[int, Target]:
     """Return by the number of a recorded callback the declared one that it matches."""
     found: dict[int, Target] = {}
     # one for each time that a node of the same name runs, for example in several processes
     binders: list[Binder] = []
     times = Counter[str]()
-    for callbacks in nodes_of(who):
+    for callbacks in nodes_of(names):
         node = callbacks[0].node_name
         if times[node] == len(binders):
             binders.append(Binder(declared))
@@ -209,31 +213,32 @@ def matches(who: Entities, declared: TaskSet) -> dict[int, Target]:
     return found
 
 
-def declared_keys(who: Entities, declared: TaskSet) -> dict[int, str]:
+def declared_keys(names: Names, declared: TaskSet) -> dict[int, str]:
     """Return by callback number the key of the declared callback."""
-    return {number: target.callback.key for number, target in matches(who, declared).items()}
+    return {number: target.callback.key for number, target in matches(names, declared).items()}
 
 
 class Matching:
     """
     Maps the callbacks of an imported recording to declared ones.
 
-    :param who: the nodes and callbacks of the recording.
+    :param names: the nodes and callbacks of the recording.
     :param threads: the processes and threads that ran callbacks.
     :param judge: the judging declaration; None: none.
     """
 
     def __init__(
-        self, name: str, who: Entities, judge: TaskSet | None
+        self, name: str, names: Names, judge: TaskSet | None
     ) -> None:
         self.task_set = judge or EMPTY_TASK_SET
-        self.warnings: list[str] = []
+        self.losses: list[Loss] = []
         #: By number of a recorded callback.
         self.target: dict[int, Target] = {}
         if judge is None:
             return
-        self.target = matches(who, judge)
+        self.target = matches(names, judge)
         found = {target.callback.key for target in self.target.values()}
-        self.warnings += report_missing(
-            name, judge, found, [c.label for c in who.every if c.kind != 'service'],
-            [c.entity for c in who.every if c.entity is not None and c.number not in self.target])
+        self.losses += report_missing(
+            name, judge, found, [c.label for c in names.callbacks if c.kind != 'service'],
+            [c.entity for c in names.callbacks
+             if c.entity is not None and c.number not in self.target])

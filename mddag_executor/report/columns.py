@@ -26,7 +26,9 @@ from typing import Any, NamedTuple
 from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.analysis.usage import ran
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import Ints, Mask, Recording, sort_by
+from mddag_executor.recording.columns import Ints, Mask
+from mddag_executor.recording.joins import sort_by
+from mddag_executor.recording.recording import Recording
 import numpy as np
 
 
@@ -58,7 +60,7 @@ def executions(replay: Replay, rows: Ints | None = None) -> tuple[list[Column], 
     others, which = np.unique(table['callback'][~declared], return_inverse=True)
     vertex = table['vertex'].astype(np.int64)
     vertex[~declared] = len(names) + which
-    names += [recording.who.name(each) for each in others.tolist()]
+    names += [recording.names.name(each) for each in others.tolist()]
     start, end = table['start'], table['end']
     reference = release + np.array([*judged.tables.rad_offset[:-1], 0])[table['vertex']]
     first = table['piece'] == 0

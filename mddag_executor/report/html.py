@@ -17,7 +17,7 @@ from mddag_executor import __version__
 from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.core.requirements import as_dags, not_met
 from mddag_executor.core.tally import total
-from mddag_executor.recording.tables import Ints
+from mddag_executor.recording.columns import Ints
 from mddag_executor.report.explained import causes_line
 from mddag_executor.report.html_data import json_for_html, page_data, ReportData, shown_misses
 from mddag_executor.report.html_tables import (
@@ -71,7 +71,7 @@ def of_outcome(
             'Replay as recorded', [('recording', trace)], result, outcome, outcome.duration_ns,
         )._replace(causes=outcome.explanation.causes(),
                    behind=outcome.explanation.longest_behind(),
-                   worker_names=outcome.recording.worker_names)
+                   worker_names=outcome.recording.names.workers)
     what, title = ('bag', 'Bag') if outcome.recorded is None else ('recording', 'Replay')
     data = _data(f'{title}, rescheduled', [(what, trace)], result,
                  Replay(outcome.computed().recording(result['workers'])), outcome.duration_ns)

@@ -19,8 +19,8 @@ from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.analysis.usage import PoolUse
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import counts, SinkTally, VERDICTS
-from mddag_executor.recording.columns import Table
-from mddag_executor.recording.tables import Ints, look_up, rows_by
+from mddag_executor.recording.columns import Ints, Table
+from mddag_executor.recording.joins import equal, rows_by
 from mddag_executor.report.columns import executions
 from mddag_executor.report.tables import missed_share, short_names
 from mddag_executor.report.text import format_ns, printable, shortened
@@ -179,7 +179,7 @@ def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:
         for sink in dag.sinks:
             mine = rows[np.isin(table['vertex'][rows] - first, _ancestors(dag, sink))]
             judged = of_sink[first + sink]
-            at = look_up(verdicts['job'][judged], table['job'][mine])
+            at = equal(verdicts['job'][judged], table['job'][mine])
             mine, judged = mine[at >= 0], judged[at[at >= 0]]
             nearer = share[judged] < least[mine]
             found[mine[nearer]], least[mine[nearer]] = judged[nearer], share[judged[nearer]]

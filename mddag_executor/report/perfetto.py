@@ -31,7 +31,9 @@ from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.core import legs_of
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import VERDICTS
-from mddag_executor.recording.tables import Ints, NOTHING, sort_by, VERTEX
+from mddag_executor.recording.columns import Ints
+from mddag_executor.recording.joins import sort_by
+from mddag_executor.recording.tables import NOTHING, VERTEX
 from mddag_executor.report.columns import executions
 from mddag_executor.report.protobuf import Bytes, fixed, joined, message, number, texts, where
 from mddag_executor.report.text import format_ns, printable
@@ -126,7 +128,7 @@ class _Writer:
         known = of['release_ns'].known
         assert known is not None
 
-        names = self._recording.worker_names
+        names = self._recording.names.workers
 
         def of_worker(row: int) -> tuple[str, int, int]:
             worker = int(table['worker'][row])

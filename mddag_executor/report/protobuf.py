@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.tables import Ints, Mask
+from mddag_executor.recording.columns import Ints, Mask
 import numpy as np
 import numpy.typing as npt
 

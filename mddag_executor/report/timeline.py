@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from mddag_executor.analysis.deadlines import Judged
 from mddag_executor.analysis.usage import in_one, PoolUse, ran, worker_spans
-from mddag_executor.recording.tables import Ints, Recording
+from mddag_executor.recording.columns import Ints
+from mddag_executor.recording.recording import Recording
 import numpy as np
 
 MOST_EXECUTIONS = 20_000
@@ -42,7 +43,7 @@ class Timeline:
         table = recording.executions
         rows = ran(table)
         self.busy_over_time = PoolUse(
-            *in_one(worker_spans(recording, recording.begin, recording.end)), _FIRST_STEP)
+            *in_one(worker_spans(recording, recording.run.begin, recording.end)), _FIRST_STEP)
         missed = np.maximum(judged.missed['completed'], judged.missed['deadline'])
         self.missed_over_time = PoolUse(missed, missed + 1, _FIRST_STEP)
         self.n_executions, self.n_missed = len(rows), len(missed)

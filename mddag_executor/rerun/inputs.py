@@ -20,7 +20,7 @@ from typing import NamedTuple
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.errors import UsageError
 from mddag_executor.output_rules import is_recording
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.recording import Recording
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
 from mddag_executor.simulate import draw_execution_times, periodic_load, read_execution_times
@@ -147,7 +147,8 @@ def open_input(
         if run is None:
             raise UsageError(
                 f'{name}: no message is recorded in it: record it with ros2 bag record')
-        messages.start, messages.end = min(run.begin, run.head.time or run.begin), run.end
+        begin = run.run.begin
+        messages.start, messages.end = min(begin, run.run.head.time or begin), run.end
         messages.pauses = []
     return messages, taken
 
@@ -158,5 +159,5 @@ def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
 
 def _recorded(run: Recording, task_set: TaskSet) -> Durations:
     tables = Tables.build(task_set, max_active_jobs=NEVER)
-    builder = LoadBuilder(run, tables, run.head.workers)
+    builder = LoadBuilder(run, tables, run.run.head.workers)
     return Durations(tables, builder.build().load, recorded=True)

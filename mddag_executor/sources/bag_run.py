@@ -19,10 +19,13 @@ import os
 
 from mddag_executor import defaults
 from mddag_executor.core import DEFAULT_DEADLINE_NS
-from mddag_executor.recording.columns import concatenate, rows
-from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.columns import concatenate, Ints, rows
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import Ints, Recording, RELEASES, sort_by
+from mddag_executor.recording.joins import sort_by
+from mddag_executor.recording.losses import Loss, Losses
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.run import Run
+from mddag_executor.recording.tables import Columns, RELEASES
 from mddag_executor.sources.bags import Bag
 from mddag_executor.sources.kinds import BagError
 from mddag_executor.text import counted, listed
@@ -123,9 +126,10 @@ def read_bag(
     releases['order'] = np.arange(len(releases))
     workers = defaults.workers(None, task_set)
     end = (bag.end or 0) + 1
-    return Recording(
+    run = Run(
         bag.name, Head(bag.start, '', task_set.file, 'rad', workers, DEFAULT_DEADLINE_NS, 0,
                        False),
-        task_set, task_set, Entities(), declared=False, imported=True, releases=releases,
-        start=bag.start, end=end, judged_until=end, workers_each=workers, messages=bag.count,
-        notes=notes, warnings=bag.warnings)
+        task_set, task_set, declared=False, imported=True, start=bag.start, end=end,
+        judged_until=end, workers_each=workers, messages=bag.count, notes=notes)
+    return Recording(run, Columns(releases=releases), missing=Losses(
+        Loss('damage', 1, text) for text in bag.warnings))

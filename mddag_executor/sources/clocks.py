@@ -22,7 +22,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.tables import different, Ints, rows_by
+from mddag_executor.recording.columns import Ints
+from mddag_executor.recording.joins import as_of, different, rows_by
 from mddag_executor.trace import TraceReader
 import numpy as np
 
@@ -111,7 +112,7 @@ def _by_topic(
     found: dict[str, list[Ints]] = defaultdict(list)
     for handle, mine in zip(handles.tolist(), rows_by(which, len(handles))):
         inits = sorted(made.get(handle, ()))
-        newest = np.searchsorted([time for time, _ in inits], events[0, mine], 'right') - 1
+        newest = as_of([time for time, _ in inits], events[0, mine])
         for number, (_, topic) in enumerate(inits):
             found[topic].append(events[:, mine[newest == number]])
     for topic, each in found.items():

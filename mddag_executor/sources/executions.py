@@ -28,22 +28,17 @@ from typing import Any
 
 from mddag_executor.core import legs_of
 from mddag_executor.core.driven import ANSWERED, GUESSED
-from mddag_executor.recording.columns import Growing, rows, Table
-from mddag_executor.recording.tables import (
-    ALL_LEGS,
+from mddag_executor.recording.columns import Growing, Ints, Mask, rows, Table
+from mddag_executor.recording.joins import (
+    as_of,
     different,
-    EXECUTIONS,
+    equal,
     groups,
-    Ints,
-    LEG,
-    look_up,
-    Mask,
-    NOTHING,
+    last_before,
     rows_by,
     sort_by,
-    UNKNOWN,
-    VERTEX,
 )
+from mddag_executor.recording.tables import ALL_LEGS, EXECUTIONS, LEG, NOTHING, UNKNOWN, VERTEX
 from mddag_executor.trace.schema import GOES_ON
 from msg_graph import TaskSet
 import numpy as np
@@ -81,7 +76,7 @@ class Numbering:
         return int(self._first[dag]) + vertex if known else -1
 
 
-class Columns:
+class Batches:
     """
     The fields of events of one kind, in the order of the file.
 
@@ -143,7 +138,7 @@ class _Dispatches:
         if not len(self._key):
             return np.full(len(thread), -1)
         key = np.searchsorted(self._numbers, thread) * _FAR + place
-        at = np.searchsorted(self._key, key) - 1
+        at = last_before(self._key, key)
         return np.where((at >= 0) & (self._thread[at] == thread), at, -1)
 
 
@@ -179,9 +174,9 @@ class ExecutionJoin:
     def add(
         self, parts: Mapping[str, Sequence[tuple[Table, Ints]]], at_end: bool = False
     ) -> None:
-        """Add events by name; see ``Columns``."""
-        dispatch, end = (Columns(parts.get(name, ())) for name in (DISPATCH, END))
-        complete = Columns([
+        """Add events by name; see ``Batches``."""
+        dispatch, end = (Batches(parts.get(name, ())) for name in (DISPATCH, END))
+        complete = Batches([
             (self._waiting, self._waiting['place']), *parts.get(COMPLETE, ())])
         self._dispatch(dispatch)
         self._end(end, *self._owned(end))
@@ -191,7 +186,7 @@ class ExecutionJoin:
         self._complete(complete, event[~waits], at[~waits])
         self._waiting = complete.rows(self._waiting.dtype, np.sort(event[waits]))
 
-    def _dispatch(self, dispatch: Columns) -> None:
+    def _dispatch(self, dispatch: Batches) -> None:
         """Add dispatched executions."""
         ready, start = dispatch['ready'], dispatch['timestamp']
         strange = (ready < 0) | (ready > start)
@@ -206,7 +201,7 @@ class ExecutionJoin:
             began=start, start=start)
         self._dispatches.add(thread, dispatch.place, np.arange(before, len(self._executions)))
 
-    def _owned(self, events: Columns) -> tuple[Ints, Ints]:
+    def _owned(self, events: Batches) -> tuple[Ints, Ints]:
         """
         Return events by execution, those of one in the order of the file, and their dispatches.
 
@@ -216,7 +211,7 @@ class ExecutionJoin:
         order = sort_by(at)
         return order, at[order]
 
-    def _end(self, end: Columns, event: Ints, at: Ints) -> None:
+    def _end(self, end: Batches, event: Ints, at: Ints) -> None:
         """End executions; the events are by dispatch."""
         table = self._executions.rows()
         event, row = event[at >= 0], self._dispatches.row[at[at >= 0]]
@@ -230,7 +225,7 @@ class ExecutionJoin:
         if len(row) < len(end):
             self._strange[f'{END} of an execution that was not dispatched'] += len(end) - len(row)
 
-    def _complete(self, complete: Columns, event: Ints, at: Ints) -> None:
+    def _complete(self, complete: Batches, event: Ints, at: Ints) -> None:
         """Complete executions; completions without execution become rows."""
         dag, vertex = (each[event] for each in self._numbering.of(
             complete['dag'], complete['vertex']))
@@ -343,7 +338,7 @@ def running_at(
     ran = np.flatnonzero((executions['end'] >= 0) & (executions['start'] >= 0))
     numbers, which = different(executions['thread'][ran])
     for asked, mine in zip(*(rows_by(each, len(numbers)) for each in (
-            look_up(numbers, thread), which))):
+            equal(numbers, thread), which))):
         if not len(asked):
             continue
         mine = ran[mine]
@@ -351,7 +346,7 @@ def running_at(
         if (start[1:] <= start[:-1]).any():
             order = sort_by(start, -end)
             mine, start, end = mine[order], start[order], end[order]
-        at = np.searchsorted(start, time[asked], 'right') - 1
+        at = as_of(start, time[asked])
         # a nested execution, or one that took no time, may have ended before
         for _ in range(_MOST_NESTED):
             outer = (at >= 0) & (end[np.maximum(at, 0)] < time[asked])

@@ -4,12 +4,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 import re
 
 from mddag_executor.core.tables import DEMOTE
 from mddag_executor.recording.head import Head, is_declared, ReplayError
+from mddag_executor.recording.losses import Loss
 from mddag_executor.trace import TraceError, TraceReader
 from mddag_executor.trace.errors import renamed
 from msg_graph import GraphError, loads, TaskSet
@@ -55,10 +56,21 @@ def declared(head: Head, name: str) -> TaskSet:
             'record the run again') from None
 
 
-def no_end(name: str) -> str:
-    """Return the warning for a run without recorded end."""
-    return (f'{name}: the end of the run is not recorded (the process was killed, or the trace is '
-            'cut): what was open is judged at the last recorded instant')
+def damage(warnings: Iterable[str], path: str, name: str) -> list[Loss]:
+    """Return the warnings of a reader about damage of a file, with the given name."""
+    return [Loss('damage', 1, renamed(text, path, name)) for text in warnings]
+
+
+def no_end(name: str) -> Loss:
+    """Return what a run without recorded end lacks."""
+    return Loss('end', 1, (
+        f'{name}: the end of the run is not recorded (the process was killed, or the trace is '
+        'cut): what was open is judged at the last recorded instant'))
+
+
+def no_jobs(name: str) -> Loss:
+    """Return what a run without jobs lacks."""
+    return Loss('empty', 1, f'{name}: no job was released in it')
 
 
 def no_run(reader: TraceReader) -> ReplayError:

@@ -22,7 +22,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 
-from mddag_executor.recording.tables import different, Ints, Mask
+from mddag_executor.recording.columns import Ints, Mask
+from mddag_executor.recording.joins import different
 from mddag_executor.sources import clocks
 from mddag_executor.sources.links import Links
 from mddag_executor.text import counted, listed

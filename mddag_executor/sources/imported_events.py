@@ -13,8 +13,8 @@ from collections.abc import Callable as Function
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.columns import concatenate, rows, Table
-from mddag_executor.recording.tables import different, Ints, sort_by
+from mddag_executor.recording.columns import concatenate, Ints, rows, Table
+from mddag_executor.recording.joins import different, sort_by
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import TraceError

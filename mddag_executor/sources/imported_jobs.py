@@ -39,18 +39,14 @@ from typing import NamedTuple
 from mddag_executor.core import EXPIRE_AFTER_NS, legs_of, Tables
 from mddag_executor.core.driven import Awaiting
 from mddag_executor.core.tables import DRIVEN
-from mddag_executor.recording.columns import rows, Table
+from mddag_executor.recording.columns import Ints, Mask, rows, Table
+from mddag_executor.recording.joins import equal_pairs, rows_by, sort_by
 from mddag_executor.recording.mapping import Target
 from mddag_executor.recording.tables import (
     EXPIRED,
-    find_pairs,
-    Ints,
     JOB_ENDS,
     LEG,
-    Mask,
     RELEASES,
-    rows_by,
-    sort_by,
     UNKNOWN,
     VERTEX,
     WITHDRAWN,
@@ -357,7 +353,7 @@ class _Doubts:
             still = still & (self._latest(key, True, until) >= release)
             for topic in vertex.callback.topics if still.any() else ():
                 number = np.full(len(jobs), self._topics.get(topic, UNKNOWN))
-                sent, _ = find_pairs(self._sent, (jobs, number))
+                sent, _ = equal_pairs(self._sent, (jobs, number))
                 doubted |= still & (self._sent_at[sent] >= until)
         return doubted
 

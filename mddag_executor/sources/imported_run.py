@@ -24,36 +24,28 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable as Function
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 import re
 
 from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER
 from mddag_executor.memory import give_back
-from mddag_executor.recording.columns import rows, Table
-from mddag_executor.recording.entities import Entities, INIT_EVENTS
+from mddag_executor.recording.columns import Ints, Mask, rows, Table
 from mddag_executor.recording.head import Head
+from mddag_executor.recording.joins import different, earliest, groups, sort_by
+from mddag_executor.recording.losses import Loss, Losses
 from mddag_executor.recording.mapping import Matching
-from mddag_executor.recording.tables import (
-    different,
-    earliest,
-    EXECUTIONS,
-    groups,
-    Ints,
-    Mask,
-    PUBLICATIONS,
-    Recording,
-    sort_by,
-    TAKES,
-    UNKNOWN,
-)
-from mddag_executor.sources.head import named_errors, no_run
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.run import Run
+from mddag_executor.recording.tables import Columns, EXECUTIONS, PUBLICATIONS, TAKES, UNKNOWN
+from mddag_executor.sources.entities import Entities, INIT_EVENTS
+from mddag_executor.sources.head import damage, named_errors, no_jobs, no_run
 from mddag_executor.sources.imported_clocks import ImportedClocks
 from mddag_executor.sources.imported_events import KINDS, moved, read_events, START
 from mddag_executor.sources.imported_jobs import ImportedJobs
-from mddag_executor.sources.links import Links, Losses
+from mddag_executor.sources.links import Links, Oddities
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Event
 from mddag_executor.trace.times import credible
 from msg_graph import Process, TaskSet
@@ -110,7 +102,7 @@ class ImportedRun:
         self.head = head or Head(
             int(starts['time'][0]), '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
         self._imported = head is None
-        self._matching = Matching(name, self.who, task_set)
+        self._matching = Matching(name, self.who.names, task_set)
         #: The declaration to judge by; none is recorded.
         self.task_set = self._matching.task_set
         self._targets = self._matching.target
@@ -120,7 +112,7 @@ class ImportedRun:
         #: The last event's time, ns.
         self.end = max(min(max(0, self.head.time), NEVER - 1),
                        int(self._events.table['time'].max(initial=0)))
-        self._odd = Losses(self.odd, 5)
+        self._odd = Oddities(self.odd, 5)
         self._fallbacks: Counter[str] = Counter()
 
     def _initialisation(self) -> list[Event]:
@@ -146,20 +138,28 @@ class ImportedRun:
         jobs = ImportedJobs(self.task_set, links, targets, first, self._clocks.distrusted)
         table['ready'], release = self._times(jobs)
         jobs.fill(table, release, last)
-        found = Recording(
-            self.name, self.head, self.task_set, self.task_set, self.who, declared=False,
-            imported=self._imported, same=False, releases=jobs.releases, executions=table,
-            publications=self._publications(), job_ends=jobs.ends, takes=self._takes(),
+        self._number_pieces(table)
+        run = Run(
+            self.name, self.head, self.task_set, self.task_set, declared=False,
+            imported=self._imported, same=False,
             start=earliest(table['ready'], jobs.releases['release']), end=self.end,
-            judged_until=self._judged_until(), lost=links.discarded,
-            workers_each=self.head.workers, links=True, callback_vertex=self._vertex,
-            worker_names=self._worker_names())
+            judged_until=self._judged_until(), workers_each=self.head.workers, links=True)
+        names = replace(self.who.names, vertices=self._vertex, workers=self._worker_names())
         if self._imported:
-            found.process_names = dict(zip(
-                self._pids, process_names(self._pids, self._events.names)))
-            found.placed = self._placed(found.process_names)
-            found.workers_each = self._workers_each()
-        found.warnings = self._warnings(found)
+            processes = dict(zip(self._pids, process_names(self._pids, self._events.names)))
+            names = replace(names, processes=processes)
+            run = replace(
+                run, placed=self._placed(processes), workers_each=self._workers_each())
+        found = self._completed(Recording(run, Columns(
+            releases=jobs.releases, executions=table, publications=self._publications(),
+            job_ends=jobs.ends, takes=self._takes()), names))
+        return replace(found, missing=Losses(self._missing(found)))
+
+    def _number_pieces(self, table: Table) -> None:
+        """Do nothing: each execution has one piece."""
+
+    def _completed(self, found: Recording) -> Recording:
+        """Return the recording with what other events say."""
         return found
 
     def _worker_names(self) -> list[str]:
@@ -349,38 +349,39 @@ class ImportedRun:
 
     # --- warnings --------------------------------------------------------------------------------
 
-    def _warnings(self, found: Recording) -> list[str]:
-        """Return missing or doubtful data, one line each."""
+    def _missing(self, found: Recording) -> Iterator[Loss]:
+        """Yield missing or doubtful data."""
         name, path = self.name, self._reader.path
-        lines = [renamed(text, path, name) for text in self._reader.warnings]
+        yield from damage(self._reader.warnings, path, name)
         if self.who.incomplete:
-            lines.append(
+            yield Loss('strange', self.who.incomplete, (
                 f'{name}: left out: {counted(self.who.incomplete, "event")} of the '
-                'initialisation without some of the fields')
-        lines += self._matching.warnings
+                'initialisation without some of the fields'))
+        yield from self._matching.losses
         if self._events.warning:
-            lines.append(f'{name}: {self._events.warning}')
-        if found.lost:
-            lines.append(
-                f'{name}: the tracer discarded {counted(found.lost, "event")} or more: '
-                'executions and messages may be missing')
-        lines += [f'{name}: {text}' for text in self._clocks.lines()]
-        lines += [f'{name}: {text}' for text in self.links.losses.lines()]
+            yield Loss('strange', 1, f'{name}: {self._events.warning}')
+        if self.links.discarded:
+            yield Loss('events', self.links.discarded, (
+                f'{name}: the tracer discarded {counted(self.links.discarded, "event")} or more: '
+                'executions and messages may be missing'))
+        for text in self._clocks.lines():
+            yield Loss('clock', 1, f'{name}: {text}')
+        yield from self.links.losses.found(name, 'events')
         unjudged = found.unjudged
         if unjudged:
             dags = [f'{found.task_set.dags[dag].name} ({n})' for dag, n in unjudged.items()]
-            lines.append(
+            total = sum(unjudged.values())
+            yield Loss('unjudged', total, (
                 f'{name}: not judged, because their events may be missing: '
-                f'{counted(sum(unjudged.values()), "job")}: {listed(dags)}')
-        lines += [f'{name}: {text}' for text in self._odd.lines()]
+                f'{counted(total, "job")}: {listed(dags)}'))
+        yield from self._odd.found(name, 'stamps')
         if self._fallbacks:
-            lines.append(
-                f'{name}: {counted(self._fallbacks.total(), "release")} by the next best stamp, '
-                'because the declared one is not recorded or years away: '
-                f'{listed(list(self._fallbacks))}')
+            total = self._fallbacks.total()
+            yield Loss('stamps', total, (
+                f'{name}: {counted(total, "release")} by the next best stamp, because the '
+                f'declared one is not recorded or years away: {listed(list(self._fallbacks))}'))
         if found.task_set.dags and not len(found.releases):
-            lines.append(f'{name}: no job was released in it')
-        return lines
+            yield no_jobs(name)
 
 
 def process_names(pids: Sequence[int], names: Mapping[tuple[int, int], str]) -> list[str]:

@@ -32,33 +32,25 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 import os
 from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.errors import UsageError
-from mddag_executor.recording.columns import concatenate, Table
-from mddag_executor.recording.entities import Entities
+from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.head import Head, is_declared, ReplayError
-from mddag_executor.recording.tables import (
-    ALL_LEGS,
-    different,
-    earliest,
-    groups,
-    Ints,
-    Jobs,
-    Mask,
-    NOTHING,
-    Recording,
-    RowNumbers,
-    sort_by,
-    TABLES,
-    UNKNOWN,
-)
+from mddag_executor.recording.jobs import Jobs
+from mddag_executor.recording.joins import different, earliest, groups, RowNumbers, sort_by
+from mddag_executor.recording.losses import Loss, Losses
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.run import Run
+from mddag_executor.recording.tables import ALL_LEGS, Columns, NOTHING, TABLES, UNKNOWN
 from mddag_executor.sources import clocks
+from mddag_executor.sources.entities import Entities
 from mddag_executor.sources.executions import Numbering
 from mddag_executor.sources.head import declared, read_head
-from mddag_executor.sources.own import end_lines, read_process
+from mddag_executor.sources.own import end_losses, Read, read_process
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.numbers import Numbers
@@ -106,7 +98,7 @@ class _Part:
     is_first: Mask
     expected: Ints
     open_jobs: list[tuple[int, int]]
-    recording: Recording
+    found: Read
     seen_at: Ints
 
     def __init__(self, place: int, path: str, first_worker: int) -> None:
@@ -139,32 +131,34 @@ class _Part:
         self, who: Entities, threads: Numbers, workers: int, count: int, progress: Progress | None
     ) -> None:
         """Read its tables, with joined times, addresses and ``workers`` (rules 1 and 2)."""
-        found, self.seen_at = read_process(
+        found = self.found = read_process(
             self.reader, self.name, self.head, who, self._edited,
             None if progress is None else lambda more: progress(count + more))
-        self.recording = found
+        tables = found.tables
+        self.seen_at = found.seen_at
         if self.shift:
             self.seen_at = self.seen_at + self.shift
             for name, columns in _TIMES.items():
                 for column in columns:
-                    times = getattr(found, name)[column]
+                    times = tables[name][column]
                     times[times > 0] += self.shift
-            if found.notices_stops is not None:
-                found.notices_stops += self.shift
+            if found.run.notices_stops is not None:
+                found.run = replace(
+                    found.run, notices_stops=found.run.notices_stops + self.shift)
         for addresses in (
-                found.executions['callback'], found.losses['callback'],
-                found.publications['publisher']):
+                tables['executions']['callback'], tables['losses']['callback'],
+                tables['publications']['publisher']):
             addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
-        worker = found.executions['worker']
+        worker = tables['executions']['worker']
         # other threads, with higher numbers, lent themselves
         worker += np.where(worker < 0, 0, self.first_worker + np.where(
             worker < self.head.workers, 0, workers)).astype(worker.dtype)
-        thread = found.executions['thread']
+        thread = tables['executions']['thread']
         numbers, of = different(thread)
         thread[:] = np.array([threads.of(self.place, each) for each in numbers.tolist()],
                              dtype=np.int64)[of]
         self.last = max(self.first, int(self.seen_at.max(initial=0)), *(
-            int(getattr(found, name)[column].max(initial=0))
+            int(tables[name][column].max(initial=0))
             for name, column in _HAPPENED.items()))
 
     def _edited(self, event: Event) -> Event:
@@ -182,35 +176,36 @@ class _Part:
         :param legs: by vertex the number of its legs; ``dag_of``: its DAG, at the end -1.
         :return: the new numbers of executions.
         """
-        found = self.recording
-        jobs = Jobs(len(found.task_set.dags), found.releases)
+        tables = self.found.tables
+        releases = tables['releases']
+        jobs = Jobs(len(self.found.run.task_set.dags), releases)
         rows = np.append(jobs.rows, UNKNOWN)
-        table = found.executions
+        table = tables['executions']
         row = rows[jobs.places(table)]
         kept = (row >= 0) | (table['vertex'] < 0)
         done = np.flatnonzero((table['completes'] != NOTHING) & (row >= 0))
         is_open = self.expected > np.bincount(row[done], np.where(
             table['leg'][done] == ALL_LEGS, legs[table['vertex'][done]], 1),
             minlength=len(self.number))
-        ended = rows[jobs.places(found.job_ends)]
+        ended = rows[jobs.places(tables['job_ends'])]
         is_open[ended[ended >= 0]] = False
         self.open_jobs = list(zip(
-            found.releases['dag'][is_open].tolist(), self.number[is_open].tolist()))
+            releases['dag'][is_open].tolist(), self.number[is_open].tolist()))
         self._note_ran(table[(row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)])
         known = row >= 0
         table['job'][known] = self.number[row[known]]
         for name in ('job_ends', 'misses', 'demotions'):
-            table = getattr(found, name)
+            table = tables[name]
             row = rows[jobs.places(table)]
             table['job'] = self.number[row] if len(self.number) else UNKNOWN
-            setattr(found, name, table[row >= 0])
-        drops = found.drops     # those of unknown jobs are still counted
+            tables[name] = table[row >= 0]
+        drops = tables['drops']     # those of unknown jobs are still counted
         row = rows[jobs.places_of(dag_of[drops['vertex']], drops['job'])]
         drops['job'] = np.append(self.number, UNKNOWN)[row]
         new = RowNumbers(kept)
-        found.executions = found.executions[kept]
-        found.releases['job'] = self.number
-        found.releases = found.releases[self.is_first]
+        tables['executions'] = tables['executions'][kept]
+        releases['job'] = self.number
+        tables['releases'] = releases[self.is_first]
         return new
 
     def _note_ran(self, started: Table) -> None:
@@ -241,7 +236,7 @@ class Joined:
         first = self._parts[0]
         self.head, self.name = first.head, ', '.join(paths)
         self.task_set = declared(first.head, first.name)
-        self.warnings: list[str] = []
+        self.losses: list[Loss] = []
         for part in self._parts:
             if part.head.yaml != self.head.yaml:
                 raise ReplayError(
@@ -296,10 +291,10 @@ class Joined:
             for part in parts:
                 part.shift -= known[machine].ahead if machine in known else 0
             if machine not in given:
-                self.warnings.append(
+                self.losses.append(Loss('clock', 1, (
                     f'{", ".join(part.name for part in parts)}: recorded on another machine than '
                     f'{self._parts[0].name}: '
-                    + clocks.said(known.get(machine), ways.get((0, machine)), parts[0].label))
+                    + clocks.said(known.get(machine), ways.get((0, machine)), parts[0].label))))
 
     def recording(self, progress: Callable[[int], None] | None = None) -> Recording:
         """
@@ -318,47 +313,57 @@ class Joined:
         self._check_run()
         head = self.head._replace(
             time=min(part.first for part in self._parts), workers=self._workers)
-        found = Recording(
-            self.name, head, self.task_set, self.task_set, who, same=False,
+        ranks = self._ranks()
+        tables, reasons = self._join(ranks, rows)
+        run = self._with_end(Run(
+            self.name, head, self.task_set, self.task_set, same=False,
             processes=len(self._parts), placed=self._placed(),
             workers_each=max(part.head.workers for part in self._parts),
-            # the last word of the trace's name
-            worker_names=[f'{part.label} {worker}' for part in self._parts
-                          for worker in range(part.head.workers)])
-        self._join(found, rows)
-        self._set_end(found)
-        found.warnings = [*self.warnings, *self._lines(found.end), *end_lines(found)]
-        return found
+            hosted=[(int(ranks[place][order]), dag, vertices)
+                    for place, order, dag, vertices in self._hosted]), tables['executions'])
+        run = replace(run, start=_begin(tables['releases'], tables['executions']))
+        lost = sum(part.found.lost for part in self._parts)
+        return Recording(
+            run, Columns(**tables), replace(
+                who.names, drop_reasons=reasons,
+                # the last word of the trace's name
+                workers=[f'{part.label} {worker}' for part in self._parts
+                         for worker in range(part.head.workers)]),
+            Losses((*self.losses, *self._lost(run.end),
+                    *end_losses(run, len(tables['releases']), lost))))
 
-    def _join(self, found: Recording, rows: Sequence[RowNumbers]) -> None:
-        """Merge the tables of all traces; ``rows``: the new numbers of executions."""
+    def _join(
+        self, ranks: Sequence[Ints], rows: Sequence[RowNumbers]
+    ) -> tuple[dict[str, Table], Sequence[str]]:
+        """
+        Return the merged tables of all traces, and the reasons of drops.
+
+        :param rows: by part the new numbers of executions.
+        """
         parts = self._parts
-        ranks = self._ranks()
         before = 0
         reasons: dict[str, int] = {}
         for part, rank in zip(parts, ranks):
-            of = part.recording
-            by = rows[part.place].new(of.publications['execution'])
-            of.publications['execution'] = np.where(by >= 0, by + before, UNKNOWN)
-            before += len(of.executions)
-            for table in (of.releases, of.executions, of.job_ends):
+            of = part.found.tables
+            by = rows[part.place].new(of['publications']['execution'])
+            of['publications']['execution'] = np.where(by >= 0, by + before, UNKNOWN)
+            before += len(of['executions'])
+            for table in (of['releases'], of['executions'], of['job_ends']):
                 known = table['order'] >= 0
                 table['order'][known] = rank[table['order'][known]]
             numbers = np.array([
-                reasons.setdefault(reason, len(reasons)) for reason in of.drop_reasons] or [0])
-            of.drops['reason'] = numbers[of.drops['reason']]
-            for name in TABLES:
-                table = getattr(of, name)
+                reasons.setdefault(reason, len(reasons))
+                for reason in part.found.drop_reasons] or [0])
+            of['drops']['reason'] = numbers[of['drops']['reason']]
+            for table in of.values():
                 if 'process' in table.names:
                     table['process'] = part.place
+        found = {}
         for name in TABLES:
-            setattr(found, name, concatenate([getattr(p.recording, name) for p in parts]))
-        found.releases = found.releases[sort_by(found.releases['order'])]
-        found.publications = found.publications[sort_by(found.publications['time'])]
-        found.drop_reasons = tuple(reasons)
-        found.hosted = [
-            (int(ranks[place][order]), dag, vertices)
-            for place, order, dag, vertices in self._hosted]
+            found[name] = concatenate([part.found.tables.pop(name) for part in parts])
+        for name, column in (('releases', 'order'), ('publications', 'time')):
+            found[name] = found[name][sort_by(found[name][column])]
+        return found, tuple(reasons)
 
     def _ranks(self) -> list[Ints]:
         """Return by part the joined positions of its positions in the order; 0 is before all."""
@@ -367,31 +372,27 @@ class Joined:
         rank[np.argsort(times, kind='stable')] = np.arange(1, len(times) + 1)
         return np.split(rank, np.cumsum([len(part.seen_at) for part in self._parts])[:-1])
 
-    def _set_end(self, found: Recording) -> None:
-        """Find when judging begins and ends (rules 4 and 5)."""
+    def _with_end(self, run: Run, executions: Table) -> Run:
+        """Return the run with the times at which judging begins and ends (rules 4 and 5)."""
         labels = {part.label for part in self._parts}
         # without restarted processes, and those that have never judged
         judging = [part.judges_from + part.shift for part in self._parts
                    if 0 < part.judges_from < NEVER
                    and part.label.partition('.')[0] not in labels - {part.label}]
         if judging:
-            found.judge_from = max(judging)
+            run = replace(run, judge_from=max(judging))
         ends = [part.end + part.shift for part in self._parts if part.end is not None]
         end = max(int(part.seen_at.max(initial=0)) for part in self._parts)
-        found.end = found.judged_until = min(end, NEVER - 1)
+        run = replace(run, end=min(end, NEVER - 1), judged_until=min(end, NEVER - 1))
         if ends:
-            found.end = max(max(part.last for part in self._parts), *ends)
-            found.judged_until, found.shut_down = max(ends), True
-        found.lost = sum(part.recording.lost for part in self._parts)
-        found.notices_stops = min(
-            (part.recording.notices_stops for part in self._parts
-             if part.recording.notices_stops is not None), default=None)
-        table = found.executions
+            run = replace(run, end=max(max(part.last for part in self._parts), *ends),
+                          judged_until=max(ends), shut_down=True)
         # a process may end before the others
-        waited = (table['end'] < 0) & (table['worker'] < 0)
-        table['start'][waited] = table['began'][waited] = found.end
-        found.start = earliest(found.releases['release'], table['ready'][
-            (table['end'] >= 0) & (table['start'] >= 0)])
+        waited = (executions['end'] < 0) & (executions['worker'] < 0)
+        executions['start'][waited] = executions['began'][waited] = run.end
+        return replace(run, notices_stops=min(
+            (part.found.run.notices_stops for part in self._parts
+             if part.found.run.notices_stops is not None), default=None))
 
     # --- jobs ------------------------------------------------------------------------------------
 
@@ -399,17 +400,17 @@ class Joined:
         """Assign numbers to jobs (rule 3), and note the expected vertices (rule 4)."""
         events: list[tuple[int, int, int, int, Any]] = []
         for part in self._parts:
-            of, seen_at = part.recording, part.seen_at
+            releases, seen_at = part.found.tables['releases'], part.seen_at
             events += [
                 (int(seen_at[order]), part.place, order, row, None)
-                for row, order in enumerate(of.releases['order'].tolist())]
+                for row, order in enumerate(releases['order'].tolist())]
             events += [(int(seen_at[order]), part.place, order, dag, vertices)
-                       for order, dag, vertices in of.hosted]
+                       for order, dag, vertices in part.found.run.hosted]
         columns = [
-            [part.recording.releases[name].tolist() for name in ('dag', 'release', 'noticed')]
-            for part in self._parts]
+            [part.found.tables['releases'][name].tolist()
+             for name in ('dag', 'release', 'noticed')] for part in self._parts]
         for part in self._parts:
-            part.number = np.full(len(part.recording.releases), UNKNOWN)
+            part.number = np.full(len(part.found.tables['releases']), UNKNOWN)
             part.is_first = np.zeros(len(part.number), dtype=np.bool_)
             part.expected = np.zeros(len(part.number), dtype=np.int64)
         events.sort(key=lambda event: event[:3])
@@ -431,7 +432,7 @@ class Joined:
                 number = self._next[dag]
                 self._next[dag] += 1
                 self._releases[dag].append((release, number, {place}))
-                part.recording.releases['release'][which] = release
+                part.found.tables['releases']['release'][which] = release
                 part.is_first[which] = True
             else:
                 number = known[1]
@@ -503,15 +504,21 @@ class Joined:
                 self.task_set.vertices[vertex].callback.node for vertex in part.ran)))
             for part in self._parts]
 
-    def _lines(self, end: int) -> Iterator[str]:
+    def _lost(self, end: int) -> Iterator[Loss]:
         """Yield missing data of each trace, and jobs that ended with its process (rule 5)."""
         for part in self._parts:
-            yield from part.recording.warnings
+            yield from part.found.losses
             if part.end is not None:
                 continue
             jobs = [f'{self.task_set.dags[dag].name} {number}' for dag, number in part.open_jobs]
-            yield (
+            yield Loss('end', 1, (
                 f'{part.name}: its end is not recorded (the process was killed, or the trace is '
                 f'cut): it ends {max(0, end - part.last) / 1e9:.3f} s before the run; '
                 + (f'{counted(len(jobs), "job")} ended with it: {listed(jobs)}' if jobs
-                   else 'no job was open in it'))
+                   else 'no job was open in it')))
+
+
+def _begin(releases: Table, executions: Table) -> int | None:
+    """Return the first release, or when the first execution became ready; None: neither."""
+    return earliest(releases['release'], executions['ready'][
+        (executions['end'] >= 0) & (executions['start'] >= 0)])

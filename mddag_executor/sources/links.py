@@ -40,12 +40,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable as Function
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.columns import rows, Table
-from mddag_executor.recording.entities import Addresses, Entities
-from mddag_executor.recording.tables import different, find_pairs, Ints, last_of, Mask, sort_by
+from mddag_executor.recording.columns import Ints, Mask, rows, Table
+from mddag_executor.recording.joins import as_of, different, equal_pairs, last_of, sort_by
+from mddag_executor.recording.losses import Kind, Loss
+from mddag_executor.sources.entities import Addresses, Entities
 from mddag_executor.sources.imported_events import (
     ADDRESSES,
     BECAME,
@@ -87,7 +88,7 @@ _SAID = {
     'unknown': ('execution', 'of a callback whose initialisation is not in it')}
 
 
-class Losses:
+class Oddities:
     """
     Counts missing or odd events, by what they affect.
 
@@ -104,13 +105,14 @@ class Losses:
         if number:
             self._counts[kind][affected] += number
 
-    def lines(self) -> list[str]:
-        """Return the counts as text."""
-        return [
-            f'{counted(sum(counts.values()), noun)} {text}: '
-            + listed([f'{name} ({n})' for name, n in sorted(
-                counts.items(), key=lambda each: (-each[1], each[0]))], self._most)
-            for counts, (noun, text) in zip(self._counts.values(), self._said.values()) if counts]
+    def found(self, name: str, kind: Kind) -> Iterator[Loss]:
+        """Yield what was counted in a recording."""
+        for counts, (noun, text) in zip(self._counts.values(), self._said.values()):
+            if counts:
+                affected = sorted(counts.items(), key=lambda each: (-each[1], each[0]))
+                yield Loss(kind, counts.total(), (
+                    f'{name}: {counted(counts.total(), noun)} {text}: '
+                    + listed([f'{each} ({n})' for each, n in affected], self._most)))
 
 
 class Lost(NamedTuple):
@@ -157,7 +159,7 @@ class Links:
     """
 
     def __init__(self, events: Events, who: Entities) -> None:
-        self.events, self.who, self.losses = events.table, who, Losses(_SAID, 3)
+        self.events, self.who, self.losses = events.table, who, Oddities(_SAID, 3)
         self.threads = events.threads
         self._pid = np.array([pid for pid, _ in events.threads], dtype=np.int64)
         kind = self.events['kind']
@@ -211,7 +213,7 @@ class Links:
             where = int(pid[group[0]]), int(address[group[0]]) % ADDRESSES
             times = table['time'][at[group]]
             since = np.array(known.times(*where), dtype=np.int64)
-            piece = np.maximum(0, np.searchsorted(since, times, 'right') - 1)
+            piece = np.maximum(0, as_of(since, times))
             for number in np.unique(piece).tolist():
                 thing = find(*where, int(since[number]) if len(since) else int(times[0]))
                 if thing is None:
@@ -408,8 +410,8 @@ class Links:
 
     def _find(self, topic: Ints, stamp: Ints) -> Ints:
         """Return the publications of source timestamps; ``_NONE`` or ``_SEVERAL`` without one."""
-        which, count = find_pairs(self._pairs, (topic, stamp))
-        unnamed, unnamed_count = find_pairs(self._pairs, (np.zeros_like(topic), stamp))
+        which, count = equal_pairs(self._pairs, (topic, stamp))
+        unnamed, unnamed_count = equal_pairs(self._pairs, (np.zeros_like(topic), stamp))
         which = np.where((count != 1) & (unnamed_count == 1), unnamed, which)
         return np.where((count > 1) & (unnamed_count != 1), _SEVERAL, self._stamped[which])
 

@@ -10,11 +10,11 @@ import os
 
 from mddag_executor.recording.head import is_declared, ReplayError
 from mddag_executor.recording.mapping import judged_by
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.recording import Recording
 from mddag_executor.sources.head import named_errors, read_head
 from mddag_executor.sources.own import read_own
 from mddag_executor.trace import TraceReader
-from msg_graph import load, TaskSet
+from msg_graph import EMPTY_TASK_SET, load, TaskSet
 
 Progress = Callable[[int], None]
 
@@ -79,6 +79,17 @@ def open_recording(
             return judged_by(read_own(reader, name, head, progress), task_set)
         from mddag_executor.sources.undeclared_run import UndeclaredRun
         return UndeclaredRun(reader, name, task_set, head, progress).read()
+
+
+def open_to_draft(
+    path: str | os.PathLike[str], name: str, progress: Progress | None = None
+) -> Recording:
+    """Read a trace to draft a declaration, by the recorded one, if any; see ``open_recording``."""
+    with named_errors(os.fspath(path), name):
+        reader = TraceReader(path)
+        head = read_head(reader)
+        return open_recording(
+            reader, None if head is None or is_declared(head) else EMPTY_TASK_SET, name, progress)
 
 
 def _opened(path: str | os.PathLike[str] | TraceReader) -> tuple[str, TraceReader | None]:

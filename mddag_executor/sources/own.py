@@ -16,38 +16,39 @@ Theory of operation
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 import re
 from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.memory import give_back
-from mddag_executor.recording.columns import concatenate, Growing, rows, Table
-from mddag_executor.recording.entities import Entities, OWN_INIT_EVENTS, signed
+from mddag_executor.recording.columns import concatenate, Growing, Ints, Mask, rows, Table
 from mddag_executor.recording.head import Head
+from mddag_executor.recording.joins import earliest, rows_by, sort_by
+from mddag_executor.recording.losses import Loss, Losses
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import (
     ABORTED,
+    Columns,
     DEMOTIONS,
     DROPS,
-    earliest,
     EXPIRED,
     FAILED,
-    Ints,
     JOB_ENDS,
     LOSSES,
-    Mask,
     MISSES,
     OUTDATED,
     PUBLICATIONS,
-    Recording,
     RELEASES,
-    rows_by,
-    sort_by,
     STOPS,
+    TAKES,
     UNKNOWN,
 )
+from mddag_executor.sources.entities import Entities, OWN_INIT_EVENTS, signed
 from mddag_executor.sources.executions import (
-    Columns,
+    Batches,
     COMPLETE,
     DISPATCH,
     END,
@@ -56,10 +57,16 @@ from mddag_executor.sources.executions import (
     PARTS,
     running_at,
 )
-from mddag_executor.sources.head import declared, named_errors, no_end, TASK_SET
+from mddag_executor.sources.head import (
+    damage,
+    declared,
+    named_errors,
+    no_end,
+    no_jobs,
+    TASK_SET,
+)
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.errors import renamed
 from mddag_executor.trace.events import Batch, Event
 from mddag_executor.trace.schema import EVENTS, PREAMBLE
 import numpy as np
@@ -103,43 +110,55 @@ def read_own(
     :param progress: called regularly with the number of events read.
     """
     with named_errors(reader.path, name):
-        source = _Source(reader, name, head, Entities(by_address=True))
-        found = source.read(progress)
-        found.warnings = [*source.doubts(), *end_lines(found)]
-    del source      # it holds more than the tables
-    give_back()
-    return found
+        who = Entities(by_address=True)
+        read = _Source(reader, name, head, who).read(progress)
+    give_back()     # events that are in no table
+    return Recording(
+        read.run, Columns(**read.tables), replace(who.names, drop_reasons=read.drop_reasons),
+        Losses((*read.losses, *end_losses(read.run, len(read.tables['releases']), read.lost))))
 
 
 def read_process(
     reader: TraceReader, name: str, head: Head, who: Entities, edit: Callable[[Event], Event],
     progress: Progress | None = None,
-) -> tuple[Recording, Ints]:
+) -> Read:
     """
-    Return the recording of one of several processes.
+    Return what was read of one of several processes.
 
     :param who: receives the nodes and callbacks; ``edit``: changes initialisation events.
-    :return: the recording; and the times of the core's events, by position in the order.
     """
     with named_errors(reader.path, name):
-        source = _Source(reader, name, head, who, edit)
-        found = source.read(progress)
-        found.warnings = source.doubts()
-        return found, source.seen_at
+        return _Source(reader, name, head, who, edit).read(progress)
 
 
-def end_lines(found: Recording) -> list[str]:
-    """Return missing data of the run as a whole, one line each."""
-    name, lines = found.name, []
-    if not found.shut_down:
-        lines.append(no_end(name))
-    if found.lost:
-        lines.append(
-            f'{name}: {counted(found.lost, "event")} lost while recording: jobs may be '
-            'missing, or count as late that were not')
-    if not len(found.releases):
-        lines.append(f'{name}: no job was released in it')
-    return lines
+def end_losses(run: Run, n_releases: int, lost: int) -> Iterator[Loss]:
+    """Yield what the run as a whole lacks."""
+    if not run.shut_down:
+        yield no_end(run.name)
+    if lost:
+        yield Loss('events', lost, (
+            f'{run.name}: {counted(lost, "event")} lost while recording: jobs may be '
+            'missing, or count as late that were not'))
+    if not n_releases:
+        yield no_jobs(run.name)
+
+
+@dataclass
+class Read:
+    """
+    What was read of a trace, before it becomes a recording.
+
+    :ivar tables: by name, see ``tables.TABLES``.
+    :ivar lost: number of events that the recorder lost.
+    :ivar seen_at: the times of the core's events, by position in the order.
+    """
+
+    run: Run
+    tables: dict[str, Table]
+    drop_reasons: Sequence[str]
+    lost: int
+    losses: Sequence[Loss]
+    seen_at: Ints
 
 
 class _Source:
@@ -160,7 +179,7 @@ class _Source:
         self._last_seen = 0
         self._others: list[tuple[int, Event]] = []
 
-    def read(self, progress: Progress | None) -> Recording:
+    def read(self, progress: Progress | None) -> Read:
         count = 0
         for batch in self._reader.batches({
                 *_ROWS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED}):
@@ -169,7 +188,7 @@ class _Source:
             if progress is not None:
                 progress(count)
         give_back()     # memory of the batches
-        return self._recording()
+        return self._read()
 
     # --- batches ---------------------------------------------------------------------------------
 
@@ -192,7 +211,7 @@ class _Source:
         self._executions.add(parts)
         for name, found in parts.items():
             if name not in PARTS:
-                self._kinds[name].add(Columns(found).rows(_ROWS[name]))
+                self._kinds[name].add(Batches(found).rows(_ROWS[name]))
 
     def _pop(self, name: str) -> Table:
         """Return the rows of a kind of event; forget them."""
@@ -203,34 +222,38 @@ class _Source:
 
     # --- putting together ------------------------------------------------------------------------
 
-    def _recording(self) -> Recording:
-        head, task_set = self._head, self._task_set
-        found = Recording(
-            self._name, head, task_set, task_set, self._who, workers_each=head.workers)
+    def _read(self) -> Read:
         self._entities()
-        found.executions, completed = self._executions.tables()
+        executions, completed = self._executions.tables()
         self._last_seen = self._executions.last
-        found.publications = self._publications(found.executions, completed)
-        found.releases, released_at = self._releases(self._pop(_RELEASE))
-        found.job_ends, ends_at = self._job_ends()
-        found.misses = self._at_vertices(
+        publications = self._publications(executions, completed)
+        releases, released_at = self._releases(self._pop(_RELEASE))
+        job_ends, ends_at = self._job_ends()
+        misses = self._at_vertices(
             _DEADLINE, MISSES, job='job', deadline='deadline', completed='completed')
-        found.demotions = self._at_vertices(_DEMOTE, DEMOTIONS, job='job', time='timestamp')
+        demotions = self._at_vertices(_DEMOTE, DEMOTIONS, job='job', time='timestamp')
         losses = self._pop(_MESSAGES_LOST)
-        found.losses = rows(LOSSES, len(losses), callback=losses['callback'],
-                            time=losses['timestamp'], count=losses['count'])
+        losses = rows(LOSSES, len(losses), callback=losses['callback'],
+                      time=losses['timestamp'], count=losses['count'])
         stops = self._pop(_STOP)
-        found.notices_stops = earliest(stops['end'])
+        notices_stops = earliest(stops['end'])
         stops = stops[stops['begin'] < stops['end']]    # the first one is empty: stops are noticed
-        found.stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
-        found.lost = sum(self._pop(_LOST)['count'].tolist())
-        self._set_end(found)
-        self._put_in_order(found, [
-            (found.releases, found.releases['noticed'], released_at),
-            (found.job_ends, found.job_ends['time'], ends_at)], completed)
-        found.start = earliest(found.releases['release'], found.executions['ready'][
-            (found.executions['end'] >= 0) & (found.executions['start'] >= 0)])
-        return found
+        stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
+        lost = sum(self._pop(_LOST)['count'].tolist())
+        drops, reasons = self._drops()
+        run = self._put_in_order(self._with_end(Run(
+            self._name, self._head, self._task_set, self._task_set, notices_stops=notices_stops,
+            workers_each=self._head.workers, start=earliest(
+                releases['release'], executions['ready'][
+                    (executions['end'] >= 0) & (executions['start'] >= 0)]))), executions, [
+            (releases, releases['noticed'], released_at),
+            (job_ends, job_ends['time'], ends_at)], completed)
+        times, in_order = self._seen
+        return Read(run, {
+            'releases': releases, 'executions': executions, 'publications': publications,
+            'job_ends': job_ends, 'misses': misses, 'demotions': demotions, 'losses': losses,
+            'stops': stops, 'drops': drops, 'takes': rows(TAKES)},
+            reasons, lost, self._doubts(), times[in_order])
 
     def _entities(self) -> None:
         self._others.sort(key=lambda each: each[0])
@@ -302,9 +325,8 @@ class _Source:
         return rows(kind, len(found), dag=dag, vertex=vertex, **{
             column: found[field] for column, field in fields.items()})
 
-    def _set_end(self, found: Recording) -> None:
-        """Find the end of the run, and process events that are not in tables."""
-        last = self._last_seen
+    def _drops(self) -> tuple[Table, Sequence[str]]:
+        """Return the dropped executions and the names of the reasons; note what is hosted."""
         drops, reasons, hosted = [], dict[str, int](), []
         for place, event in self._others:
             if event[0] == _DROP:
@@ -317,31 +339,36 @@ class _Source:
                 if vertices is not None:
                     hosted.append((event[1], place, event[4], vertices))
             if event[0] in (_DROP, _HOSTED):
-                last = max(last, event[1])
+                self._last_seen = max(self._last_seen, event[1])
+        self._hosting = sorted(hosted, key=lambda h: h[:2])
         vertex, job, time, reason = zip(*drops) if drops else ((), (), (), ())
-        found.drops = rows(DROPS, len(drops), vertex=vertex, job=job, time=time, reason=reason)
-        found.drop_reasons = tuple(reasons)
+        return rows(DROPS, len(drops), vertex=vertex, job=job, time=time,
+                    reason=reason), tuple(reasons)
+
+    def _with_end(self, run: Run) -> Run:
+        """Return the run with the times at which judging began and ended."""
         judging = self._pop(_JUDGE_FROM)
-        last = max(last, int(judging['timestamp'].max(initial=0)))
+        last = max(self._last_seen, int(judging['timestamp'].max(initial=0)))
         possible = (judging['release'] >= 0) & (judging['release'] <= NEVER)
         self._left_out(_JUDGE_FROM, 'an impossible time', ~possible)
         judging = judging[possible]
         for place in sort_by(judging['timestamp'])[-1:]:
-            found.judge_from = int(judging['release'][place])
-        self._hosting = sorted(hosted, key=lambda h: h[:2])
+            run = replace(run, judge_from=int(judging['release'][place]))
         last = min(last, NEVER - 1)     # a run without end cannot be rescheduled
-        found.end = found.judged_until = last
+        run = replace(run, end=last, judged_until=last)
         self._shutdown_at: tuple[int, int] | None = None
         shutdown = self._pop(_SHUTDOWN)
         if len(shutdown):
             now, judged = int(shutdown['timestamp'][0]), int(shutdown['end'][0])
             if last <= now < NEVER and 0 <= judged <= now:
-                found.end, found.judged_until, found.shut_down = now, judged, True
+                run = replace(run, end=now, judged_until=judged, shut_down=True)
                 self._shutdown_at = now, int(shutdown['place'][0])
             else:
                 self._strange[f'{_SHUTDOWN} at an impossible time'] += 1
-        if found.end == 0:
-            found.end = found.judged_until = min(max(0, self._head.time), NEVER - 1)
+        if run.end == 0:
+            last = min(max(0, self._head.time), NEVER - 1)
+            run = replace(run, end=last, judged_until=last)
+        return run
 
     def _hosted(self, event: Event) -> frozenset[int] | None:
         dag, text = event[4:6]
@@ -354,8 +381,8 @@ class _Source:
         return frozenset(found)
 
     def _put_in_order(
-        self, found: Recording, core: list[tuple[Table, Any, Ints]], completed: Table
-    ) -> None:
+        self, run: Run, executions: Table, core: list[tuple[Table, Any, Ints]], completed: Table
+    ) -> Run:
         """Assign positions in the order to the core's events (rule 4)."""
         single = [(time, place) for time, place, *_ in self._hosting]
         if self._shutdown_at is not None:
@@ -368,36 +395,31 @@ class _Source:
         self._seen = times, in_order
         rank = np.empty(len(times), dtype=np.int32)
         rank[in_order] = np.arange(len(times), dtype=np.int32)
-        found.executions['order'][completed['row']] = rank[:len(completed)]
+        executions['order'][completed['row']] = rank[:len(completed)]
         at = len(completed)
         for table, _, _ in core:
             table['order'] = rank[at:at + len(table)]
             at += len(table)
         ranks = iter(rank[at:].tolist())
-        found.hosted = [(next(ranks), dag, vertices) for *_, dag, vertices in self._hosting]
-        if self._shutdown_at is not None:
-            found.judged_order = next(ranks)
+        run = replace(run, hosted=[
+            (next(ranks), dag, vertices) for *_, dag, vertices in self._hosting])
+        return run if self._shutdown_at is None else replace(run, judged_order=next(ranks))
 
-    @property
-    def seen_at(self) -> Ints:
-        """Return the times of the core's events, by position in the order."""
-        times, in_order = self._seen
-        return times[in_order]
-
-    def doubts(self) -> list[str]:
-        """Return defects of the trace, one line each."""
+    def _doubts(self) -> list[Loss]:
+        """Return defects of the trace."""
         name, path = self._name, self._reader.path
-        lines = [renamed(text, path, name) for text in self._reader.warnings]
+        found = damage(self._reader.warnings, path, name)
         if self._strange:
             what, n = min(self._strange.items(), key=lambda item: (-item[1], item[0]))
-            lines.append(
-                f'{name}: left out: {counted(sum(self._strange.values()), "event")} that make no '
-                f'sense, most often ({n}) {what}')
+            total = sum(self._strange.values())
+            found.append(Loss('strange', total, (
+                f'{name}: left out: {counted(total, "event")} that make no sense, most often '
+                f'({n}) {what}')))
         orphans = self._executions.orphans
         if orphans:
-            lines.append(
-                f'{name}: {counted(orphans, "completed execution")} whose start is not in it')
-        return lines
+            found.append(Loss('open', orphans, (
+                f'{name}: {counted(orphans, "completed execution")} whose start is not in it')))
+        return found
 
 
 def _known(stamps: Ints) -> Ints:

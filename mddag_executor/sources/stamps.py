@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mddag_executor.recording.tables import Ints
+from mddag_executor.recording.columns import Ints
 from mddag_executor.sources.stamps_without_numbers import (
     BeingSent,
     find_in_order,

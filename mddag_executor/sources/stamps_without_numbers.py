@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 
-from mddag_executor.recording.tables import Ints
+from mddag_executor.recording.columns import Ints
 import numpy as np
 
 ROUNDING_NS = 1_000

@@ -29,20 +29,15 @@ the causes of executions.  Differences:
 
 from __future__ import annotations
 
-from mddag_executor.recording.columns import rows
-from mddag_executor.recording.entities import INIT_EVENTS
-from mddag_executor.recording.tables import (
-    DROPS,
-    find_pairs,
-    Ints,
-    LOSSES,
-    Mask,
-    NOTHING,
-    Recording,
-    rows_by,
-    sort_by,
-    UNKNOWN,
-)
+from collections.abc import Iterator
+from dataclasses import replace
+
+from mddag_executor.recording.columns import Ints, Mask, rows, Table
+from mddag_executor.recording.joins import as_of, equal_pairs, rows_by, sort_by
+from mddag_executor.recording.losses import Loss
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, UNKNOWN
+from mddag_executor.sources.entities import INIT_EVENTS
 from mddag_executor.sources.executions import number_pieces
 from mddag_executor.sources.head import no_end
 from mddag_executor.sources.imported_events import (
@@ -124,7 +119,7 @@ class _OwnLinks(Links):
             mine = np.sort(np.concatenate([taken[:0], *(
                 taken[takes_by[each]] for each in subscriptions.get(id(callback), ()))]))
             these = dispatched[those] if len(mine) else mine
-            place = np.searchsorted(time[mine], table['b'][these], 'right') - 1
+            place = as_of(time[mine], table['b'][these])
             these, place = these[place >= 0], place[place >= 0]
             # a message starts one execution; its pieces have the same ready time
             _, first, which = np.unique(place, return_index=True, return_inverse=True)
@@ -151,14 +146,15 @@ class UndeclaredRun(ImportedRun):
         'execution', 'of timers whose due times are not recorded and that kept to no period '
         '(reset, or by another clock): released when they were noticed')}
 
-    def read(self) -> Recording:
-        """Return the recording."""
-        found = super().read()
-        table = found.executions
+    def _number_pieces(self, table: Table) -> None:
         number_pieces(table, np.arange(len(table)), 'callback', table['completes'] == NOTHING)
-        found.shut_down = bool((self._events.table['kind'] == SHUTDOWN).any())
-        if not found.shut_down:
-            found.warnings.append(no_end(self.name))
+
+    def _missing(self, found: Recording) -> Iterator[Loss]:
+        yield from super()._missing(found)
+        if not found.run.shut_down:
+            yield no_end(self.name)
+
+    def _completed(self, found: Recording) -> Recording:
         drops, reasons, losses = [], dict[str, int](), []
         for event in self._events.others:
             if event[0].name not in (_DROP, _MESSAGES_LOST):
@@ -173,12 +169,15 @@ class UndeclaredRun(ImportedRun):
             elif isinstance(fields.get('count'), int):
                 losses.append((number, time, fields['count']))
         vertex, times, reason = zip(*drops) if drops else ((), (), ())
-        found.drops = rows(
+        dropped = rows(
             DROPS, len(drops), vertex=vertex, job=UNKNOWN, time=times, reason=reason)
-        found.drop_reasons = tuple(reasons)
         callbacks, times, count = zip(*losses) if losses else ((), (), ())
-        found.losses = rows(LOSSES, len(losses), callback=callbacks, time=times, count=count)
-        return found
+        lost = rows(LOSSES, len(losses), callback=callbacks, time=times, count=count)
+        return replace(
+            found, columns=replace(found.columns, drops=dropped, losses=lost),
+            names=replace(found.names, drop_reasons=tuple(reasons)),
+            run=replace(found.run, shut_down=bool(
+                (self._events.table['kind'] == SHUTDOWN).any())))
 
     def _judged_until(self) -> int:
         table = self._events.table
@@ -205,7 +204,7 @@ class UndeclaredRun(ImportedRun):
         """Return the first pieces of executions, and which end them (rule 4)."""
         runs = self.links.runs
         pairs = runs['callback'], runs['ready']
-        first, _ = find_pairs(pairs, pairs)
+        first, _ = equal_pairs(pairs, pairs)
         newest, lost = np.full(len(runs), UNKNOWN), np.zeros(len(runs), dtype=np.bool_)
         np.maximum.at(newest, first, runs['end_at'])
         lost[first[runs['end_at'] < 0]] = True

@@ -34,11 +34,14 @@ from mddag_executor.core.state import (
     SINK_DEMOTED,
 )
 from mddag_executor.recording import tables
+from mddag_executor.recording.columns import Ints, Table
 from mddag_executor.recording.columns import rows as table_of
-from mddag_executor.recording.columns import Table
-from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import Ints, look_up, Recording, sort_by, UNKNOWN
+from mddag_executor.recording.joins import earliest, equal, sort_by
+from mddag_executor.recording.names import Names
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.run import Run
+from mddag_executor.recording.tables import UNKNOWN
 from mddag_executor.results.replays import PathsResult
 from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
 from mddag_executor.simulate.load import edge_numbers, FAILS
@@ -88,19 +91,19 @@ class ComputedRun(NamedTuple):
         :param workers: number of workers.
         """
         task_set, found = self.task_set, _Tables(self)
-        who = Entities(by_address=True)
-        who.note('ros2:rclcpp_callback_register', {
-            '_timestamp': 0, '_vpid': 0, 'callback': 0, 'symbol': 'undeclared callbacks'})
         releases, executions, job_ends = found.in_order()
-        return Recording(
+        run = Run(
             task_set.file, Head(0, task_set.text, task_set.file, '', workers,
                                 DEFAULT_DEADLINE_NS, 0, False),
-            task_set, task_set, who, same=False, releases=releases, executions=executions,
-            job_ends=job_ends, drops=found.drops(), drop_reasons=('newer', 'expired'),
-            demotions=found.demotions(), unsent=found.unsent(),
-            start=tables.earliest(releases['release'], executions['ready']),
-            end=self.end, judged=self.judged, judged_until=self.end, workers_each=workers,
+            task_set, task_set, same=False, unsent=found.unsent(),
+            start=earliest(releases['release'], executions['ready']), end=self.end,
+            judged=self.judged, judged_until=self.end, workers_each=workers,
             judge_from=self.judge_from, judged_releases=self.judged_releases)
+        return Recording(
+            run, tables.Columns(
+                releases=releases, executions=executions, job_ends=job_ends, drops=found.drops(),
+                demotions=found.demotions()),
+            Names(symbols={0: 'undeclared callbacks'}, drop_reasons=('newer', 'expired')))
 
     def requirements(self) -> PathsResult:
         """Return ``paths`` and ``requirements`` of the result; nothing if nothing is required."""
@@ -284,7 +287,7 @@ class _Tables:
             ready[rows] = times[each.job[rows]]
         for (before, after), edge in edge_numbers(self._tables).items():
             ended, rows = ended_of[before], of_vertex[after]
-            at = look_up(each.job[rows], each.job[ended])
+            at = equal(each.job[rows], each.job[ended])
             ended, rows = ended[at >= 0], rows[at[at >= 0]]
             arrived = each.end[ended]
             if len(load.delay_base):

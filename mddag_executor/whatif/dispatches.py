@@ -21,7 +21,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mddag_executor.recording.tables import Ints, Mask
+from mddag_executor.recording.columns import Ints, Mask
+from mddag_executor.recording.joins import as_of
 import numpy as np
 
 
@@ -49,7 +50,7 @@ def dispatch_times(
         at_once = waiting[n_free - n_ended <= n_workers]
         could[at_once] = free[at_once]
         mine = mine[holding[mine]]
-        place = np.searchsorted(end[mine], start[mine], 'right') - 1
+        place = as_of(end[mine], start[mine])
         could[mine] = np.maximum(could[mine], np.where(place >= 0, end[mine][place], 0))
     late: Ints = np.maximum(0, start - could)
     return late

@@ -48,7 +48,9 @@ from mddag_executor.analysis.spans import crowded, Spans
 from mddag_executor.analysis.usage import ran
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.recording import tables as recorded_tables
-from mddag_executor.recording.tables import Ints, Recording, sort_by
+from mddag_executor.recording.columns import Ints
+from mddag_executor.recording.joins import as_of, sort_by
+from mddag_executor.recording.recording import Recording
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import edge_numbers, FAILS, RUNS, SKIPPED
@@ -189,10 +191,10 @@ class LoadBuilder:
         """Find the dispatch times of pieces; keep undeclared pieces."""
         table = self._executions
         rows = ran(table)
-        if self._recording.imported:    # others have interpreters and threads of their own
+        if self._recording.run.imported:    # others have interpreters and threads of their own
             process = self._recording.executions['process'][rows]
             other = (table['vertex'][rows] < 0) & (process > 0)
-            self.left_out = int((other & (process < len(self._recording.placed))).sum())
+            self.left_out = int((other & (process < len(self._recording.run.placed))).sum())
             rows = rows[~other]
         vertex, piece, ready, start, end, worker, holds, cpu, completes = (
             table[name][rows] for name in (
@@ -238,7 +240,7 @@ class LoadBuilder:
             if not self._timer[dag] or self._process[source] != process or not len(end):
                 continue
             release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
-            ended = end[np.maximum(0, np.searchsorted(end, noticed, 'right') - 1)]
+            ended = end[np.maximum(0, as_of(end, noticed))]
             known = (ended >= release) & (ended <= noticed) & (
                 start[np.searchsorted(start, ended)] >= noticed)
             turn[known] = ended[known]
@@ -247,7 +249,7 @@ class LoadBuilder:
 
     def _groups(self, rows: Ints, vertex: Ints) -> Ints:
         """Return numbers of the mutually exclusive groups of executions, or -1."""
-        known = self._recording.who.groups
+        known = self._recording.names.groups
         callbacks, which = self._recording.callbacks()
         group_of = [known.get(each, _NOT_RECORDED) for each in callbacks.tolist()]
         # small numbers, which are sorted fast: recorded groups, then declared ones
@@ -329,7 +331,7 @@ class LoadBuilder:
         row, vertex_of = self._row[by], table['vertex'][by]
         known = (row >= 0) & (vertex_of >= 0)
         row, vertex_of, publisher = row[known], vertex_of[known], publisher[known]
-        publishers = self._recording.who.every_publisher
+        publishers = self._recording.names.publishers
         found = np.zeros(len(self._columns['sent']), dtype=np.uint8)
         for number in np.unique(publisher).tolist():
             name = publishers[number].topic if number in publishers else None

@@ -22,7 +22,8 @@ from mddag_executor.core.tables import DEMOTE, ON_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
 from mddag_executor.recording.head import Head, ReplayError
-from mddag_executor.recording.tables import Recording, UNKNOWN
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.tables import UNKNOWN
 from mddag_executor.results.replays import (
     PathsResult,
     RecordedRun,
@@ -60,7 +61,7 @@ class Reschedule:
         warnings: list[str], skip: int, overheads: bool, processes: Sequence[Process],
         recorded: Replay | None,
     ) -> None:
-        self.task_set, self._run, self.notes = run.task_set, run, run.notes
+        self.task_set, self._run, self.notes = run.task_set, run, run.run.notes
         self.work, self.tables, self.settings = work, tables, settings
         self.recorded, self.processes, self.warnings = recorded, processes, warnings
         self.workers = settings.workers * settings.processes
@@ -88,12 +89,12 @@ class Reschedule:
     @property
     def duration_ns(self) -> int:
         """Return the duration of the recording."""
-        return max(0, self.settings.duration_ns - self._run.begin)
+        return max(0, self.settings.duration_ns - self._run.run.begin)
 
     @property
     def _scheduled_ns(self) -> int:
         """Return how long callbacks are scheduled: a part also has jobs of before its begin."""
-        begin = self._run.begin
+        begin = self._run.run.begin
         return self.settings.duration_ns - min([begin, *self.work.load.times[:1]])
 
     def computed(self) -> ComputedRun:
@@ -101,7 +102,7 @@ class Reschedule:
         end = self.settings.duration_ns
         return ComputedRun(
             self.task_set, self.work.load, self.log, self.decisions, end, end, True,
-            self.work.jobs, self.settings.judge_from, self._run.judged_releases)
+            self.work.jobs, self.settings.judge_from, self._run.run.judged_releases)
 
     def result(self) -> RescheduleResult:
         """Return the result format of ``replay --json``, including the recorded run."""
@@ -145,8 +146,8 @@ class Reschedule:
         if self._requires:
             more['requirements'] = self.recorded.requirements.result()
         return {
-            'policy': self.recorded.recording.head.policy,
-            'workers': self.recorded.recording.head.workers, **self.recorded.tally.result(),
+            'policy': self.recorded.recording.run.head.policy,
+            'workers': self.recorded.recording.run.head.workers, **self.recorded.tally.result(),
             **more}
 
 
@@ -200,7 +201,7 @@ def reschedule(
         path, task_set, name, progress)
     if run.task_set is EMPTY_TASK_SET:
         raise undeclared(run.name)
-    head, each, given = run.head, run.workers_each, policy
+    head, each, given = run.run.head, run.run.workers_each, policy
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
     cpus = cpus or head.cpus or None
     if preemptive is None:
@@ -212,9 +213,9 @@ def reschedule(
         max_active_jobs=head.max_active_jobs if head.max_active_jobs > 0 else NEVER,
         expire_after=EXPIRE_AFTER_NS)
     tables = tables_of(run.task_set)
-    recorded = Replay(run, skip) if run.messages is None else None
+    recorded = Replay(run, skip) if run.run.messages is None else None
     with gc_paused():
-        builder = LoadBuilder(run, tables, each, _processes(run, run.placed), times)
+        builder = LoadBuilder(run, tables, each, _processes(run, run.run.placed), times)
     give_back()
     placed = _placed(run, builder) if processes is None else processes(
         run.task_set, builder.times())
@@ -238,12 +239,12 @@ def reschedule(
             f'and no execution_time is declared: {listed(work.unknown)}',
             'give a GRAPH that declares it')
     tables = with_groups(
-        tables, builder.callback_of, run.who.groups, declared_first=not run.same)
+        tables, builder.callback_of, run.names.groups, declared_first=not run.run.same)
     left_out = builder.left_out
     del builder     # the load has copies of its data
     give_back()
-    warnings, judge_from = run.warnings, run.begin + skip if skip else -NEVER
-    begin, judge_until = run.judged_releases or (-NEVER, NEVER)
+    warnings, judge_from = run.missing.lines(), run.run.begin + skip if skip else -NEVER
+    begin, judge_until = run.run.judged_releases or (-NEVER, NEVER)
     if recorded is not None:
         warnings, judge_from = recorded.warnings, recorded.judged.judge_from
     warnings += notes
@@ -251,7 +252,7 @@ def reschedule(
         warnings.append(
             f'{run.name}: {counted(left_out, "run")} of undeclared callbacks in processes of '
             'declared ones take no time: declare them, as mddag graph from-trace does')
-    if cpus is not None and run.declared and len(work.load.computed) == 0:
+    if cpus is not None and run.run.declared and len(work.load.computed) == 0:
         warnings.append(
             f'{run.name}: CPU times are not recorded in it, so with --cpus each '
             'execution computes all the time')
@@ -280,11 +281,11 @@ def _placed(run: Recording, builder: LoadBuilder) -> Sequence[Process]:
     The trace of one of several processes only has the callbacks of that process.
     """
     declared = run.task_set.processes
-    if run.placed:
-        return declared or run.placed
+    if run.run.placed:
+        return declared or run.run.placed
     vertices = run.task_set.vertices
     ran = {run.task_set.process_of(vertices[v].callback.node) for v in builder.callback_of}
-    return declared if len(ran) == 1 or not run.same else ()
+    return declared if len(ran) == 1 or not run.run.same else ()
 
 
 def _settings(

@@ -80,7 +80,8 @@ def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
     dag_of = judged.tables.dag_of
     for _, vertex, job, now, reason in recording.drops.tolist():
         yield (now, NEVER - 2, 0), 'drop', now, 0, (
-            address[vertex], dag_of[vertex], local[vertex], job, recording.drop_reasons[reason])
+            address[vertex], dag_of[vertex], local[vertex], job,
+            recording.names.drop_reasons[reason])
     for _, dag, vertex, job, now in recording.demotions.tolist():
         yield (now, NEVER - 2, 0), 'demote', now, 0, (dag, local[vertex], job)
 

@@ -31,13 +31,13 @@ class Oracle:
         self.decisions = []
         self.scheduler = Scheduler(self.tables, 1)
         self.scheduler.state.scalars[SKIP] = skip
-        if recording.judge_from > -NEVER:
-            judge_from(self.scheduler.state, recording.judge_from)
+        if recording.run.judge_from > -NEVER:
+            judge_from(self.scheduler.state, recording.run.judge_from)
         self.slots = {}
         self.task_set = task_set
         self.published = defaultdict(set)
         self.published_by = defaultdict(set)
-        sent, publishers = recording.publications, recording.who.every_publisher
+        sent, publishers = recording.publications, recording.names.publishers
         for publisher, by in sent[['publisher', 'execution']].tolist():
             if by >= 0 and publisher in publishers:
                 ran = recording.executions[by]
@@ -57,9 +57,9 @@ class Oracle:
         events += [(order, 1, (*row, order)) for order, *row in done[list(columns)].tolist()]
         events += [(order, 2, (dag, job, time, reason)) for _, dag, _, job, time, reason, order
                    in recording.job_ends.tolist()]
-        events += [(order, 3, (dag, here)) for order, dag, here in recording.hosted]
-        if recording.judged:
-            events.append((recording.judged_order, 4, (recording.judged_until,)))
+        events += [(order, 3, (dag, here)) for order, dag, here in recording.run.hosted]
+        if recording.run.judged:
+            events.append((recording.run.judged_order, 4, (recording.run.judged_until,)))
         for _, kind, what in sorted(events, key=lambda event: event[0]):
             getattr(self, _KINDS[kind])(*what)
             decided = self.scheduler.decisions()

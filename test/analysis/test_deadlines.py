@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts from tables are those of the driver, of the scheduler core, and of each part."""
 
-from dataclasses import replace
+from dataclasses import FrozenInstanceError, replace
 from pathlib import Path
 import re
 import tempfile
@@ -14,7 +14,7 @@ from mddag_executor.analysis.deadlines import Judged
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DROP, JOB_END, SINK_NOT_DUE
 from mddag_executor.core.tally import total
-from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, WITHDRAWN
+from mddag_executor.recording.tables import ABORTED, EXPIRED, FAILED, TABLES, WITHDRAWN
 from msg_graph import loads
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_verdicts_of_any_tables(seed, data):
     generator = np.random.default_rng(data.draw(st.integers(0, 2**32)))
     tables = [recording.releases, recording.executions, recording.job_ends]
     tables = [table[generator.integers(0, len(table), len(table))] if place and len(table)
-              else table for place, table in enumerate(tables)]
+              else table.copy() for place, table in enumerate(tables)]
     orders = np.concatenate([table['order'][table['order'] >= 0] for table in tables])
     ranks = generator.permutation(len(orders)) if data.draw(st.booleans()) else \
         np.argsort(np.argsort(orders, kind='stable'), kind='stable')
@@ -69,10 +69,12 @@ def test_verdicts_of_any_tables(seed, data):
             5, int(generator.integers(0, 5)), replace=False).tolist()))]
     start = recording.start or 0
     changed = replace(
-        recording,
-        releases=releases, executions=tables[1], job_ends=tables[2], hosted=hosted,
-        judged_order=int(generator.integers(0, len(orders) + 1)) * 2 - 1,
-        judge_from=start + 50 * MS if data.draw(st.booleans()) else -NEVER)
+        recording, columns=replace(
+            recording.columns, releases=releases, executions=tables[1], job_ends=tables[2]),
+        run=replace(
+            recording.run, hosted=hosted,
+            judged_order=int(generator.integers(0, len(orders) + 1)) * 2 - 1,
+            judge_from=start + 50 * MS if data.draw(st.booleans()) else -NEVER))
     check(changed, data.draw(st.sampled_from([0, 30 * MS])))
 
 
@@ -236,6 +238,24 @@ def test_a_recording_in_a_program(tmp_path):
         r'<Recording .*demo_short\.mcap: 1\.4\d\d s, \d+ jobs, \d+ executions>', repr(recording))
     with pytest.raises(KeyError, match="no table 'nope': the tables are releases, executions, "):
         recording.to_pandas('nope')
-    recording.executions['end'][0] = -1     # a missing value rounds no other
-    ends = recording.to_pandas('executions').end
+    table = recording.executions.copy()
+    table['end'][0] = -1    # a missing value rounds no other
+    changed = replace(recording, columns=replace(recording.columns, executions=table))
+    ends = changed.to_pandas('executions').end
     assert ends.isna()[0] and ends[1:].tolist() == recording.executions['end'][1:].tolist()
+
+
+def test_a_finished_recording_is_not_written(tmp_path):
+    path = tmp_path / 'run.mcap'
+    VirtualRun(path, loads(SMALL, 'g.yaml'), 0)
+    for recording in (open_recording(path), reschedule(path).computed().recording(),
+                      open_recording(path).cut(0, 100 * MS),
+                      open_recording(path, loads(SMALL, 'other.yaml'))):
+        for name, kind in TABLES.items():
+            for column in kind.names:
+                with pytest.raises(ValueError, match='read-only'):
+                    getattr(recording, name)[column] = 0
+        for each, field in ((recording, 'run'), (recording.run, 'end'),
+                            (recording.columns, 'releases')):
+            with pytest.raises(FrozenInstanceError):
+                setattr(each, field, None)

@@ -14,7 +14,8 @@ from mddag_executor.analysis.paths import Flows
 from mddag_executor.analysis.requirements import Requirements
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_NOT_DUE
 from mddag_executor.executor.path_watch import PathWatch
-from mddag_executor.recording.tables import Recording
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.run import Run
 from msg_graph import loads
 from msg_graph.segments import bound, segments
 import numpy as np
@@ -249,7 +250,7 @@ class Rule:
 
 @given(st.lists(FLOW, max_size=25), st.booleans(), st.integers(1, 40), st.integers(40, 100))
 def test_reactions_are_those_of_slow_rules(flows, sampled, required, until):
-    recording = Recording('r', None, loads(RARE, 'g'), None, None, judged_until=until)
+    recording = Recording(Run('r', None, loads(RARE, 'g'), None, judged_until=until))
     requirements = Requirements(recording, None)
     begin = np.array([b for b, _, _ in flows], dtype=np.int64)
     end, silent = (np.array([b + took if how == which else -1 for b, how, took in flows],
@@ -288,7 +289,7 @@ def watched(task_set, recording, chance):
             watch.left(row)
         if not chance.randrange(50):    # it changes nothing
             watch.result(now, -2 ** 62)
-    return watch.result(recording.judged_until, -2 ** 62)
+    return watch.result(recording.run.judged_until, -2 ** 62)
 
 
 @pytest.mark.parametrize('seeds', [

@@ -76,7 +76,7 @@ def test_entities_may_come_and_go_while_recorded(make_executor, make_node, tmp_p
     names = [vertex.name for vertex in run.task_set.vertices]
     assert all(run.callback_name(row['callback']) == names[row['vertex']]
                for row in run.executions)
-    assert {(names[row['vertex']], run.who.every_publisher[int(row['publisher'])].topic)
+    assert {(names[row['vertex']], run.names.publishers[int(row['publisher'])].topic)
             for row in run.publications} == {('/a:step', '/left'), ('/a:tick', '/right')}
 
 

@@ -297,7 +297,7 @@ def test_callbacks_are_summed_up_in_one_pass():
     table = Table({name: table[name].view(Counted) for name in table.names})
     Counted.rows = 0
     found = recorded_callbacks(SimpleNamespace(
-        executions=table, who=SimpleNamespace(name='c{:03}'.format)))
+        executions=table, names=SimpleNamespace(name='c{:03}'.format)))
     assert Counted.rows < 20 * len(table)
     assert list(found) == [f'c{n:03}' for n in range(200)]
     assert found['c007'] == {'executions': 4, 'unfinished': 1, 'busy_ns': 28, 'shortest_ns': 7,
@@ -358,7 +358,7 @@ def test_only_the_own_thread_of_a_callback_makes_it_wait(three_processes):
     for job in result['jobs']:
         behind = [each['callback'] for part in job['parts'] for each in part['behind']]
         assert behind == (['/detect:tidy'] if job['cause'] == 'waited' else [])
-    assert outcome.recording.worker_names == [
+    assert outcome.recording.names.workers == [
         'cam 1, thread 1', 'det 2, thread 3', 'hog 3, thread 5']
     table = outcome.recording.executions
     assert {*zip(table['process'].tolist(), table['thread'].tolist())} == {(0, 1), (1, 3), (2, 5)}
@@ -371,7 +371,7 @@ def test_each_recorded_process_has_a_pool_of_its_own(workers, three_processes):
     result = outcome.result()
     assert (result['policy'], result['workers']) == ('fifo', 2)
     assert result['processes'] == [
-        {'name': 'cam', 'nodes': ('/camera',)}, {'name': 'det', 'nodes': ('/detect',)}]
+        {'name': 'cam', 'nodes': ['/camera']}, {'name': 'det', 'nodes': ['/detect']}]
     sinks = result['dags']['/camera']['sinks']['/detect:detect'], replay(
         three_processes, graph).result()['dags']['/camera']['sinks']['/detect:detect']
     assert [(sink['completed'], sink['late']) for sink in sinks] == [(10, 7)] * 2
@@ -387,5 +387,5 @@ def test_a_draft_has_the_recorded_processes(three_processes, call, tmp_path):
     graph = tmp_path / 'drafted.yaml'
     call('graph', 'from-trace', three_processes, '--accept', '-o', graph)
     assert [each.name for each in load(graph).processes] == ['cam', 'det', 'hog']
-    assert [each.name for each in open_recording(three_processes, load(graph)).placed] == [
+    assert [each.name for each in open_recording(three_processes, load(graph)).run.placed] == [
         'cam', 'det', 'hog']

@@ -9,7 +9,8 @@ from mddag_executor.core import NEVER
 from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
 from mddag_executor.recording.columns import rows
-from mddag_executor.recording.tables import Jobs, RELEASES
+from mddag_executor.recording.jobs import Jobs
+from mddag_executor.recording.tables import RELEASES
 from mddag_executor.sources.clocks import offsets
 from mddag_executor.trace import TraceFile
 import numpy as np
@@ -115,7 +116,7 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late, boot):
     breakdown = sink(result)['breakdown']
     assert breakdown['mean']['transport_ns'] == MS, breakdown
     assert result['workers'] == 4 and set(result['callbacks']) == {'/a:tick', '/b:take'}
-    assert outcome.recording.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
+    assert outcome.recording.names.workers == ['up 0', 'up 1', 'down 0', 'down 1']
     assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
 
 

@@ -19,7 +19,7 @@ class Links:
 
     def __init__(self, found):
         table, sent = found.executions, found.publications
-        names = [found.who.name(number) for number in table['callback'].tolist()]
+        names = [found.names.name(number) for number in table['callback'].tolist()]
         start, end = ((table[name] - BEGIN).tolist() for name in ('start', 'end'))
         ended = np.flatnonzero(table['end'] >= 0)
         ended = ended[np.argsort(table['end'][ended], kind='stable')].tolist()
@@ -27,7 +27,7 @@ class Links:
         self.links = [
             (name, at, None if message < 0 else int(sent['time'][message]) - BEGIN)
             for name, at, message in zip(names, start, table['message'].tolist())]
-        publishers = found.who.every_publisher
+        publishers = found.names.publishers
         self.published_at = [
             (publishers[number].topic if number in publishers else '', time - BEGIN)
             for number, time in zip(sent['publisher'].tolist(), sent['time'].tolist())]
@@ -35,7 +35,7 @@ class Links:
 
 def linked(path):
     recording = open_recording(path)
-    return Links(recording), [line.removeprefix(f'{path}: ') for line in recording.warnings]
+    return Links(recording), [line.removeprefix(f'{path}: ') for line in recording.missing.lines()]
 
 
 @pytest.fixture
@@ -201,7 +201,7 @@ def test_what_was_initialised_before_the_recording(tmp_path):
     recorded.add('ros2:rclcpp_timer_link_node', 93 * MS, 1, 10_011, 1)
     recorded.run(CAMERA, 1, 131 * MS, 132 * MS)
     recording = open_recording(recorded.write())
-    assert [(c.label, c.grid) for c in recording.who.every] == [
+    assert [(c.label, c.grid) for c in recording.names.callbacks] == [
         ('/camera timer 100ms', BEGIN + 30 * MS)]
     drafted, = System(recorded.path).draft().callbacks()
     assert (drafted.node, drafted.period_ns) == ('/camera', 100 * MS)

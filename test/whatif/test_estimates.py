@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from mddag_executor import replay
 from mddag_executor.analysis.usage import group_waits, in_groups, PoolUse
 from mddag_executor.recording.columns import rows
-from mddag_executor.recording.entities import Entities
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.tables import EXECUTIONS, Recording
+from mddag_executor.recording.recording import Recording
+from mddag_executor.recording.run import Run
+from mddag_executor.recording.tables import Columns, EXECUTIONS
+from mddag_executor.sources.entities import Entities
 from mddag_executor.whatif.dispatches import dispatch_times
 import numpy as np
 import pytest
@@ -96,10 +98,10 @@ def test_waits_for_the_group():
               (9, 0, 40, 41, 0), (1, 29, 42, 44, 1), (2, 43, 45, -1, 0)]
     callback, ready, start, end, piece = (list(column) for column in zip(*pieces))
     task_set = small()
-    recording = Recording(
-        'by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, groups, end=60,
-        executions=rows(EXECUTIONS, len(pieces), callback=callback, vertex=-1, ready=ready,
-                        began=start, start=start, end=end, piece=piece))
+    run = Run('by hand', Head(0, '', '', 'rad', 1, 0, 0, False), task_set, task_set, end=60)
+    recording = Recording(run, Columns(executions=rows(
+        EXECUTIONS, len(pieces), callback=callback, vertex=-1, ready=ready, began=start,
+        start=start, end=end, piece=piece)), groups.names)
     # the second from 4 to 10; the third of the group from 8 to 10 and from 12 to 20
     assert group_waits(recording).tolist() == [0, 6, 0, 10, 0, 0, 1]
     (_, members, starts, ends), = in_groups(recording)

@@ -27,15 +27,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
+from mddag_executor.recording.names import Address, Callback, KINDS, Names, Node, Publisher
 from mddag_executor.trace import EVENTS
-from msg_graph import format_duration
-from msg_graph.binding import Entity, entity_name
-from msg_graph.duration import exact_duration
 
 _T = TypeVar('_T')
-KINDS = ('timer', 'subscription', 'service')
 # In the order in which they refer to one another.
 _INIT = (
     'rcl_node_init', 'rcl_publisher_init', 'rcl_subscription_init', 'rcl_service_init',
@@ -55,78 +52,6 @@ INIT_EVENTS = OWN_INIT_EVENTS | {
 
 Event = tuple[Any, ...]
 Fields = dict[str, Any]
-Address = tuple[int, int]
-"""Process and address."""
-
-
-class Node(NamedTuple):
-    """A node of a process."""
-
-    pid: int
-    name: str
-    time: int
-
-
-class Publisher(NamedTuple):
-    """A publisher; `node` is None if its node is not recorded."""
-
-    number: int
-    node: Node | None
-    topic: str
-
-
-class Callback:
-    """
-    A timer, subscription or service of a recording, with its callback.
-
-    :ivar number: identifies the callback; 0: no callback is recorded.
-    :ivar kind: ``timer``, ``subscription``, ``service``, ``other`` (an action, a task, …; it has
-        only a symbol) or ``unknown``.
-    :ivar start: topic or name of the service; empty for timers.
-    :ivar period: of its timer, ns; 0 for others.
-    :ivar made: when its timer, subscription or service was created, ns.
-    :ivar grid: origin of its timer's periods, ns; None: not recorded.
-    :ivar group: number of its mutually exclusive group; -1: reentrant, None: unknown.
-    :ivar symbol: of its function; empty if not recorded.
-    :ivar address: process and address of its callback; of several the last one.
-    """
-
-    __slots__ = ('number', 'node', 'kind', 'start', 'period', 'made', 'grid', 'group', 'symbol',
-                 'label', 'address', 'rmw')
-
-    def __init__(self, node: Node | None, kind: str, start: str = '', period: int = 0,
-                 made: int = 0, grid: int | None = None) -> None:
-        self.number = 0
-        self.node = node
-        self.kind = kind
-        self.start = start
-        self.period = period
-        self.made = made
-        self.grid = grid
-        self.group: int | None = None
-        self.symbol = ''
-        self.label = ''
-        self.address: Address | None = None
-        self.rmw: Address | None = None
-
-    @property
-    def node_name(self) -> str:
-        """Return the name of its node; empty if not recorded."""
-        return '' if self.node is None else self.node.name
-
-    @property
-    def description(self) -> str:
-        """Return its node and trigger."""
-        node = self.node_name or 'a node that is not recorded'
-        if self.kind == 'timer':
-            return f'{node} timer {format_duration(self.period)}'
-        return f'{node} {self.kind} {self.start}'.rstrip()
-
-    @property
-    def entity(self) -> Entity | None:
-        """Return the entity that a declaration may bind to it; None if its node is unknown."""
-        return None if self.node is None else Entity(
-            self.node.name, self.kind, self.start, self.period or None)
 
 
 class Addresses(Generic[_T]):
@@ -171,7 +96,7 @@ class Entities:
     The nodes, publishers, callbacks and groups of a recording.
 
     :param by_address: whether callbacks and publishers are numbered by their addresses.
-    :ivar every: the callbacks; ``made``: all timers, subscriptions and services.
+    :ivar names: what was read, by numbers.
     """
 
     def __init__(self, by_address: bool = False) -> None:
@@ -181,23 +106,15 @@ class Entities:
         self.callbacks: Addresses[Callback] = Addresses()
         #: By the handle in `rmw_take`: the subscription's callbacks.
         self.taken: Addresses[list[Callback]] = Addresses()
-        self.every: list[Callback] = []
-        self.made: list[Callback] = []
-        self.every_publisher: dict[int, Publisher] = {}
-        #: The names of the nodes.
-        self.names_of_nodes: dict[str, None] = {}
+        self.names = Names()
         #: Time of the first of these events, ns.
         self.begin = 0
         #: Number of ignored events that lack a field.
         self.incomplete = 0
-        #: By a callback's number its mutually exclusive group; -1: reentrant.
-        self.groups: dict[int, int] = {}
         self._entities: dict[str, Addresses[Callback]] = {kind: Addresses() for kind in KINDS}
         self._holders: Addresses[Callback] = Addresses()
         self._groups: Addresses[tuple[int, bool]] = Addresses()
         self._n_groups = 0
-        self._by_number: dict[int, Callback] = {}
-        self._symbols: dict[int, str] = {}      # of otherwise unknown callbacks
 
     # --- reading ---------------------------------------------------------------------------------
 
@@ -248,12 +165,12 @@ class Entities:
         if name == 'rcl_node_init':
             node = Node(pid, f'{f["namespace"].rstrip("/")}/{f["node_name"]}', time)
             self.nodes.add(pid, f['node_handle'], time, node)
-            self.names_of_nodes[node.name] = None
+            self.names.nodes[node.name] = None
         elif name == 'rcl_publisher_init':
             handle = f['publisher_handle']
-            number = signed(handle) if self._by_address else len(self.every_publisher) + 1
+            number = signed(handle) if self._by_address else len(self.names.publishers) + 1
             publisher = Publisher(number, self._node(f), f['topic_name'])
-            self.every_publisher[number] = publisher
+            self.names.publishers[number] = publisher
             self.publishers.add(pid, handle, time, publisher)
         elif name == 'rcl_subscription_init':
             self._made('subscription', f, f['topic_name']).rmw = pid, f['rmw_subscription_handle']
@@ -274,7 +191,7 @@ class Entities:
         elif name == 'rclcpp_callback_register':
             callback = self.callbacks.nearest(pid, f['callback'], time)
             if callback is None:
-                self._symbols[signed(f['callback'])] = f['symbol']
+                self.names.symbols[signed(f['callback'])] = f['symbol']
             elif not callback.symbol:
                 callback.symbol = f['symbol']
         elif name.endswith('_callback_added'):
@@ -297,7 +214,7 @@ class Entities:
             None if is_timer else self._node(f), kind, start, f['period'] if is_timer else 0,
             time, time if is_timer else None)
         self._entities[kind].add(f['_vpid'], f[f'{kind}_handle'], time, entity)
-        self.made.append(entity)
+        self.names.made.append(entity)
         return entity
 
     def _callback(self, kind: str, f: Fields, of: Addresses[Callback], holder: int) -> None:
@@ -311,9 +228,9 @@ class Entities:
                 self.taken.add(*callback.rmw, callback.made, [callback])
 
     def _number(self, callback: Callback, address: int) -> None:
-        self.every.append(callback)
-        callback.number = signed(address) if self._by_address else len(self.every)
-        self._by_number[callback.number] = callback
+        self.names.callbacks.append(callback)
+        callback.number = signed(address) if self._by_address else len(self.names.callbacks)
+        self.names.by_number[callback.number] = callback
 
     def _add_to_group(self, f: Fields, kind: str) -> None:
         pid, time = f['_vpid'], f['_timestamp']
@@ -321,12 +238,12 @@ class Entities:
         group = self._groups.nearest(pid, f['callback_group_addr'], time)
         if callback is not None and callback.number and group is not None:
             callback.group = group[0] if group[1] else -1
-            self.groups[callback.number] = callback.group
+            self.names.groups[callback.number] = callback.group
 
     def _label(self) -> None:
         """Give callbacks unique labels."""
         used: dict[str, int] = {}
-        for callback in sorted(self.every, key=lambda c: (c.made, c.number)):
+        for callback in sorted(self.names.callbacks, key=lambda c: (c.made, c.number)):
             description = callback.description
             number = used[description] = used.get(description, 0) + 1
             callback.label = description if number == 1 else f'{description} #{number}'
@@ -338,7 +255,7 @@ class Entities:
         found = self.callbacks.latest(pid, address, time)
         if found is None:
             # an action, a task or a guard condition has only a symbol
-            symbol = self._symbols.get(signed(address), '')
+            symbol = self.names.symbols.get(signed(address), '')
             found = Callback(None, 'other' if symbol else 'unknown', made=time)
             found.symbol = symbol
             self._number(found, address)
@@ -346,22 +263,6 @@ class Entities:
                 f'callback {found.number} of process {pid}, whose start is not recorded')
             self.callbacks.add(pid, address, time, found)
         return found
-
-    def topic(self, number: int) -> str:
-        """Return the topic of a subscription's callback; empty for others."""
-        callback = self._by_number.get(number)
-        return callback.start if callback is not None and callback.kind == 'subscription' else ''
-
-    def name(self, number: int) -> str:
-        """Return the name of an undeclared callback."""
-        callback = self._by_number.get(number)
-        if callback is None:
-            return self._symbols.get(number, 'a callback whose start is not recorded')
-        if callback.label or callback.node is None:
-            return callback.label or callback.symbol
-        what = exact_duration(callback.period) if callback.period else callback.start
-        return entity_name(callback.node.name, callback.symbol, f'{callback.kind} {what}')
-
 
 def signed(address: int) -> int:
     """Return an address as a signed 64-bit number, as in columns."""
