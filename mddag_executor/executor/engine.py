@@ -189,6 +189,9 @@ class Engine:
         self._step = Step()
         urgency = self.scheduler.policy.urgency
         self._keys_are_times = urgency != OTHER_KEYS
+        # whether the ends of most executions only matter to the core
+        self._is_plain = (
+            record is None and self.path_watch is None and not self._optional_edges)
         #: whether ``publishes`` is to be called
         self.notes_publications = record is not None or self.path_watch is not None
         self._default_deadline = default_deadline
@@ -825,8 +828,27 @@ class Engine:
             if self.record is not None:
                 self._record_run(work, start, end, vtid, worker)
             return
+        if self._holders:
+            self._let_go(work)
+        if self._is_plain and not failed and entity.awaiting is None and (
+                not self.verdicts.tally.overdue):
+            x, work.x = work.x, -1
+            origin = work.origin
+            if self._complete(x, end) and origin is not None:
+                habit = entity.habit
+                note_time(
+                    self.tables, self._state, origin.vertex, habit.needs_ns, habit.holds, now)
+        else:
+            self._finished_watched(work, start, end, now, vtid, worker, failed)
+        if self._state.decisions:
+            self._decided(now)
+
+    def _finished_watched(
+        self, work: Work, start: int, end: int, now: int, vtid: int, worker: int, failed: bool
+    ) -> None:
+        """End an execution that failed, may answer, or is recorded or watched; see there."""
+        entity = work.entity
         x, work.x = work.x, -1
-        self._let_go(work)
         origin, record = work.origin, self.record
         entity.failed += failed
         completes = [] if origin is None else [origin]
@@ -877,8 +899,6 @@ class Engine:
             self._record_run(work, start, end, vtid, worker)
         if self.path_watch is not None:
             self.path_watch.left(work)
-        if self._state.decisions:
-            self._decided(now)
 
     def _withhold(
         self, work: Work, origin: Origin, failed: bool, now: int

@@ -77,7 +77,8 @@ class TimerEntity(ListenerEntity):
 
     __slots__ = (
         'until', 'period', 'last_period', 'due', 'entry', 'simulated', 'may_be_simulated',
-        '_next_call', '_call', '_clock', '_is_steady', '_offset', '_queue')
+        '_next_call', '_call', '_clock', '_is_steady', '_offset', '_queue', 'allowance',
+        'period_of_allowance')
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
@@ -114,6 +115,8 @@ class TimerEntity(ListenerEntity):
         self.may_be_simulated = timer.clock.clock_type == ClockType.ROS_TIME
         self._offset = self.due = 0
         self.last_period = timer.timer_period_ns
+        # how long it may stay unnoticed while a callback computes, and with which period
+        self.allowance = self.period_of_allowance = -1
         self.entry: list[Any] | None = None
         self.simulated = False
         self.listen_in(rooms, place.loop, f'timers {self.node}')
@@ -265,7 +268,13 @@ class TimerQueue:
 
     def _push(self, source: TimerEntity, due: int) -> None:
         source.due = due
-        self._agenda.set(source, due, due + self.allowance(source, source.last_period))
+        latest = due
+        if not source.is_eager():
+            if source.period_of_allowance != source.last_period:
+                source.period_of_allowance = source.last_period
+                source.allowance = self.allowance(source, source.last_period)
+            latest += source.allowance
+        self._agenda.set(source, due, latest)
 
     def ask_after_jump(self) -> None:
         """Ask rcl about all timers whose clocks may have jumped."""

@@ -105,9 +105,14 @@ class Work:
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
-    __slots__ = (
-        'entity', 'function', 'args', 'then', 'x', 'coroutine', 'origin', 'worker',
-        'ready_ns', 'due_ns', 'cpu_ns', 'yields', 'paused_ns', 'answers', 'published', 'sent')
+    # defaults of the class: most executions never set some of them
+    coroutine: Any = None
+    origin: Origin | None = None
+    answers: Origin | None = None
+    published: frozenset[str] = frozenset()
+    sent: tuple[tuple[str, int], ...] = ()
+    x = worker = -1
+    ready_ns = due_ns = cpu_ns = yields = paused_ns = 0
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -117,13 +122,6 @@ class Work:
         self.function = function
         self.args = args
         self.then = then
-        self.coroutine: Any = None
-        self.origin: Origin | None = None
-        self.answers: Origin | None = None
-        self.published: frozenset[str] = frozenset()
-        self.sent: tuple[tuple[str, int], ...] = ()
-        self.x = self.worker = -1
-        self.ready_ns = self.due_ns = self.cpu_ns = self.yields = self.paused_ns = 0
 
     def step(self, must_check: bool = True) -> Any:
         """
@@ -174,8 +172,6 @@ def _nothing() -> None:
 
 class TaskWork(Work):
     """An execution of an rclpy ``Task``; exceptions are the task's."""
-
-    __slots__ = ()
 
     def step(self, must_check: bool = True) -> Any:
         """Run the task once; return None when it is done."""

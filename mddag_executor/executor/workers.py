@@ -761,15 +761,15 @@ class WorkerPool:
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
         if self.running and not (self.is_stepping and me.thread is not None):
             step = engine.step(me.worker, now, self.polling > 0)
-            while step.work in self._rejoining:
+            while self._rejoining and step.work in self._rejoining:
                 self._hand_over(step, now)
                 step = engine.step(me.worker, now, self.polling > 0)
         else:
             step = engine.look(now, self.is_stepping)
-        if step.deadline != due.overdue.deadline:
-            due.overdue.set(step.deadline)
         work = step.work
         if work is None:
+            if step.deadline != due.overdue.deadline:
+                due.overdue.set(step.deadline)
             if self._verdicts.missed != self._misses:
                 self._note_misses()
             if me.thread is not None:  # else a visitor: the thread of a spin_once
@@ -784,6 +784,8 @@ class WorkerPool:
         if step.overtaken is not None:
             self._pause(step.overtaken, me)
         me.is_spare = not (step.is_short or step.holder is work)
+        if step.deadline != due.overdue.deadline and (self.polling or not step.is_short):
+            due.overdue.set(step.deadline)  # else there is time until it ends
         if self.is_stepping:
             due.arm(now - self._offset)
         elif self.polling:
