@@ -322,7 +322,7 @@ class PoolWatch:
             lost.append('the trace cannot be written')
         values = {
             'policy': self._engine.scheduler.policy.name, 'workers': str(workers),
-            'idle_workers': str(self._engine.idle_workers), 'lent': str(self._pool.lent),
+            'idle_workers': str(self._engine.idle_workers), 'lent': str(self._pool.lending.n_lent),
             'queue': str(self._engine.queue_length), 'computing': str(self._registry.computing()),
             'callbacks_per_s': f'{step["ran"] * 1e9 / passed:.1f}',
             'busy_ratio': f'{step["busy_ns"] / passed / workers:.3f}',

@@ -169,7 +169,7 @@ class Engine:
         self.on_late = on_late
         self.undeclared = 0
         # entities whose executions a callback group has refused
-        self.to_ask_again: list[Entity] = []
+        self._to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
         # see 4. above: the execution that runs meanwhile, since when, and those that wait, whose
         # ids (``Work.x``) are below -1
@@ -758,8 +758,8 @@ class Engine:
         self.scheduler.leave_group(work.x)
 
     def ask_again(self) -> None:
-        """Make executions ready again that a callback group has refused."""
-        refused, self.to_ask_again = self.to_ask_again, []
+        """Make executions ready again that a callback group has refused; also at each end."""
+        refused, self._to_ask_again = self._to_ask_again, []
         for entity in refused:
             x = next(iter(entity.waiting), -1)
             if x >= 0 and self._state.x_state[x] == SUSPENDED:
@@ -842,6 +842,8 @@ class Engine:
             self._finished_watched(work, start, end, now, vtid, worker, failed)
         if self._state.decisions:
             self._decided(now)
+        if self._to_ask_again:
+            self.ask_again()
 
     def _finished_watched(
         self, work: Work, start: int, end: int, now: int, vtid: int, worker: int, failed: bool
@@ -948,6 +950,7 @@ class Engine:
         self._let_go(work)
         self.scheduler.suspend(work.x)
         self._work[work.x] = work
+        self.ask_again()
 
     def refused(self, work: Work, now: int) -> None:
         """Put an execution back that its callback group has refused (see ``work``)."""
@@ -963,7 +966,7 @@ class Engine:
         work.answers = None
         self._work[x] = work
         entity.waiting = {x: None, **entity.waiting}
-        self.to_ask_again.append(entity)
+        self._to_ask_again.append(entity)
         if 0 < entity.depth < len(entity.waiting) and not entity.keeps_oldest:
             self._drop(entity, x, 'qos_depth', now)  # a newer one has arrived meanwhile
 
@@ -981,6 +984,7 @@ class Engine:
         work.x = -1
         work.entity.ran += ran
         work.entity.dropped += not ran
+        self.ask_again()
 
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
@@ -994,6 +998,7 @@ class Engine:
             self.path_watch.left(work)
         self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
         self._decided(now)
+        self.ask_again()
 
     def _record_run(
         self, work: Work, start: int, end: int, vtid: int, worker: int, goes_on: bool = False

@@ -17,6 +17,7 @@ from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import CHECK_NS, CHECK_PART, GilCheck, LAST_CHECK_NS
+from mddag_executor.executor.pausing import Pauses
 from mddag_executor.executor.work import Work
 
 
@@ -32,14 +33,8 @@ class Threads(Protocol):
 
     engine: Engine
     agenda: Agenda
+    pauses: Pauses
     now: int
-
-    def end_pauses(self) -> None:
-        """Let paused callbacks go on."""
-
-    @property
-    def is_watched(self) -> bool:
-        """Return whether a paused thread checks the execution that holds the interpreter."""
 
     def thread_of(self, work: Work) -> Thread | None:
         """Return the thread that runs an execution."""
@@ -84,12 +79,17 @@ class HolderCheck:
             self._act(now)  # the first reading, with which the next one is compared
         self._arm_by(self._set(now))
 
+    def begin_if_wanted(self, now: int) -> None:
+        """Begin to check if anything waits while an execution holds the interpreter."""
+        if self._interpreter.is_wanted():
+            self.begin(now)
+
     def begin_late(self, now: int) -> None:
         """Begin at once, if what holds the interpreter has held it for longer than usual."""
         holder = self._interpreter.holder
         if (holder is not None
                 and self._interpreter.usual_end(holder) < now + self._offset
-                and not self._pool.is_watched and not self._check.has_begun(holder)):
+                and not self._pool.pauses.is_watched and not self._check.has_begun(holder)):
             self.begin(now, is_late=True)
 
     def come_due(self) -> None:
@@ -105,7 +105,7 @@ class HolderCheck:
         if self._interpreter.holders:
             at = self._interpreter.overtaking_at() - self._offset
             at = min(at if at > now else NEVER,
-                     NEVER if self._pool.is_watched else self._check.at)
+                     NEVER if self._pool.pauses.is_watched else self._check.at)
         if at == NEVER:
             self._cancel()
         elif at != self._at:
@@ -138,4 +138,4 @@ class HolderCheck:
         elif self._check.waits(thread.ident, thread.vtid, now):
             self._check.end()
             self._pool.engine.stop_holding(holder)
-            self._pool.end_pauses()
+            self._pool.pauses.end()

@@ -31,7 +31,7 @@ import sysconfig
 import threading
 from time import monotonic_ns
 from types import CodeType, FrameType
-from typing import Any
+from typing import Any, Protocol
 
 import mddag_executor
 from mddag_executor.executor.gil import GilCheck
@@ -45,6 +45,74 @@ _LIBRARY = os.path.join(sysconfig.get_path('stdlib'), '')
 _FOREIGN = ('site-packages', 'dist-packages')
 _KEPT_OUT = tuple(
     os.path.join(os.path.dirname(module.__file__ or ''), '') for module in (mddag_executor, rclpy))
+
+
+class Holding(Protocol):
+    """The worker pool, as pauses see it: see ``workers.WorkerPool``."""
+
+    engine: Any
+    lock: Any
+    offset: int
+    now: int
+
+    def tick(self) -> int:
+        """Return the engine's time now."""
+
+    def thread_of(self, work: Any) -> Any:
+        """Return the thread that runs an execution."""
+
+    def wake_for_more(self) -> None:
+        """Wake a thread if an idle worker may start an execution."""
+
+
+class Pauses:
+    """
+    The callbacks that were overtaken, and pause; most methods need the engine's lock.
+
+    :ivar paused: the pauses, by their executions.
+    """
+
+    def __init__(self, pool: Holding) -> None:
+        self._pool = pool
+        self.paused: dict[Any, Pause] = {}
+
+    def begin(self, overtaken: Any, me: Any) -> None:
+        """Let the callback pause that the execution of a thread overtakes."""
+        thread = self._pool.thread_of(overtaken)
+        if thread is not None and overtaken not in self.paused:
+            me.pause = self.paused[overtaken] = Pause(thread)
+        # else the last one that overtook it has just ended
+
+    def end(self) -> None:
+        """Let those go on that are overtaken no more."""
+        pool = self._pool
+        overtaken = pool.engine.interpreter.overtaken
+        for work in [each for each in self.paused if each not in overtaken]:
+            pause = self.paused.pop(work)
+            work.paused_ns += pool.now - pool.offset - pause.since
+            pause.end()
+
+    @property
+    def is_watched(self) -> bool:
+        """Return whether a paused thread checks the execution that holds the GIL."""
+        return any(pause.is_watching for pause in self.paused.values())
+
+    def overtaker(self) -> tuple[Any, Any]:
+        """Return the execution that holds the GIL, and its thread; without the lock."""
+        pool = self._pool
+        with pool.lock:
+            holder = pool.engine.interpreter.holder
+            return holder, None if holder is None else pool.thread_of(holder)
+
+    def overtaker_waits(self, urgent: Any) -> None:
+        """Take the GIL from an execution that does not compute; without the lock."""
+        pool = self._pool
+        with pool.lock:
+            pool.tick()
+            if pool.engine.interpreter.holder is urgent:
+                pool.engine.stop_holding(urgent)
+                self.end()
+                pool.wake_for_more()
 
 
 class Pause:
@@ -99,14 +167,14 @@ class Pause:
 
     def _wait(self) -> None:
         """Wait for ``end``, which is called too when what holds the GIL does not compute."""
-        pool = self._thread.pool
+        pauses = self._thread.pool.pauses
         check, work = GilCheck(), None
         while True:
-            before, (work, urgent) = work, pool.overtaker()
+            before, (work, urgent) = work, pauses.overtaker()
             if work is not before:
                 check = GilCheck()
             if urgent is not None and check.waits(urgent.ident, urgent.vtid, monotonic_ns()):
-                pool.overtaker_waits(work)  # it may need a lock of this one
+                pauses.overtaker_waits(work)  # it may need a lock of this one
             if self._may_go_on.acquire(timeout=CHECK_S):
                 return
 

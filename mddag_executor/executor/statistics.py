@@ -44,7 +44,7 @@ def statistics(
         'requirements': requirements, 'stops': stops,
         'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
-        'queue': waiting, 'idle_workers': idle, 'lent': pool.lent,
+        'queue': waiting, 'idle_workers': idle, 'lent': pool.lending.n_lent,
         'unattributed': {
             'unknown': engine.attribution.unknown,
             'doubtful': engine.attribution.doubtful},

@@ -24,14 +24,8 @@ Theory of operation
     time.  A callback is short if it usually ends within ``SHORT_CALLBACK_NS`` of its start or of a
     publication that it has made.  If it runs longer, a parked thread looks.
 5.  *Time* is in ``due``.
-6.  *Lending.*  A callback that waits inside ``Client.call`` returns its worker to the core.  If
-    fewer threads are left than there are workers, a thread is made.  At most ``MOST`` callbacks
-    lend at the same time; further ones keep their workers.  When it has its answer, it *rejoins*:
-    it waits in the core like any other execution, and its thread waits for its permit.  The thread
-    that dispatches it hands its worker over, and chooses again.  All workers may run callbacks
-    that wait for this one (it may own a lock).  So if in ``REJOIN_NS`` no execution has ended, and
-    the process has computed nothing, it goes on without a worker; as it does when a spin ends, or
-    in ``spin_once``, where only one callback runs.
+6.  *Lending.*  A callback that waits inside ``Client.call`` has no worker meanwhile
+    (``lending``).
 7.  *Coroutines.*  A coroutine that waits for a future is suspended.  It keeps its callback group
     but no worker.  When the future is done, the coroutine also becomes ready again.
 8.  *Errors.*  An exception of a callback or of a thread of the pool goes to ``fail`` and ends the
@@ -42,26 +36,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from enum import Enum
+from contextlib import contextmanager
 from functools import partial
 import threading
-from time import monotonic_ns, process_time_ns
+from time import monotonic_ns
 from typing import Any, TYPE_CHECKING
 import weakref
 
 from mddag_executor.clocks import TraceClock
-from mddag_executor.errors import from_user_code
 from mddag_executor.executor.agenda import Agenda
-from mddag_executor.executor.attribution import PublisherState
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
-    ALONE_NS,
     END_S,
     HISTORY,
-    MOST,
     MOST_YIELD_NS,
-    REJOIN_NS,
     SHORT_CALLBACK_NS,
 )
 from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN, QuickCallback
@@ -69,12 +57,13 @@ from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.engine import Engine, Step
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.hall import Announced, Spinner
+from mddag_executor.executor.lending import Lending
 from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
-from mddag_executor.executor.pausing import can_pause, Pause
+from mddag_executor.executor.pausing import can_pause, Pauses
 from mddag_executor.executor.shutdown import is_over
+from mddag_executor.executor.threads import ThreadState, WorkerThread
 from mddag_executor.executor.timers import Fired, TimerQueue
 from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Destroyed, Refused, Work
@@ -88,133 +77,8 @@ def _nothing() -> None:
     pass
 
 
-class ThreadState(Enum):
-    """
-    What a thread does; it changes under the engine's lock only.
-
-    ::
-
-                  called, or looks, and finds an execution
-            ┌───────────────────────────────────────────────▶┐
-          PARKED ◀──────────────────────────────────────── RUNNING ──▶ OUT
-            │ ▲   nothing to run: others wait or compute     ▲ │ ▲       │
-            │ │                                              │ │ └───────┘ answer, and its turn
-            ▼ │                                    an event, │ │
-          WAITING ◀──────────────────────────────────────────┴─┘ nothing to run
-
-    A thread of the pool begins and ends as PARKED, that of ``spin_once`` as RUNNING.
-
-    :ivar next: the states that may follow; a thread that stays in one does not change.
-    """
-
-    next: tuple[ThreadState, ...]
-
-    PARKED = 'parked'       # waits to be called, or for the time of a look
-    WAITING = 'waiting'     # waits for events
-    RUNNING = 'running'     # runs a callback
-    OUT = 'out'             # runs one that has lent its worker, and waits or waits for its turn
-
-
-for _state, _next in (
-    (ThreadState.PARKED, (ThreadState.WAITING, ThreadState.RUNNING)),
-    (ThreadState.WAITING, (ThreadState.PARKED, ThreadState.RUNNING)),
-    (ThreadState.RUNNING, (ThreadState.PARKED, ThreadState.WAITING, ThreadState.OUT)),
-    (ThreadState.OUT, (ThreadState.RUNNING, ThreadState.PARKED, ThreadState.WAITING)),
-):
-    _state.next = _next
-
-
 # module globals are quicker to read than members of the enum
 _PARKED, _WAITING, _RUNNING = ThreadState.PARKED, ThreadState.WAITING, ThreadState.RUNNING
-
-
-class WorkerThread:
-    """
-    A thread that runs callbacks.
-
-    :ivar name: its name, in what an ``InvariantError`` tells.
-    :ivar work: the running execution.
-    :ivar worker: the number of its last worker in the core.
-    :ivar state: what it does; only the pool changes it.
-    :ivar permit: a lock, released to let its callback go on.
-    :ivar has_lent: whether its callback has returned its worker at any time; ``is_out``: whether
-        it has none now; ``waits``: whether it still waits for what it lent its worker for.
-    :ivar measurement: of its running callback; None: it is not measured.
-    :ivar paused_ns: for how long the running callback has paused.
-    :ivar pause: the pause of the callback that it has just overtaken.
-    :ivar waits_since: since when it has waited in the epoll, on the trace's clock.
-    :ivar is_spare: whether its last callback has left the events to another thread.
-    :ivar published: when the running callback first published (monotonic ns); 0: not yet.
-    :ivar start: when the execution that has just ended began; ``end``: when it ended (on the
-        trace's clock).
-    :ivar outcome: its exception, or the future that it waits for, if it goes on later; None: it
-        has finished.
-    """
-
-    __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
-                 'state', 'is_spare', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
-                 'waits_since', 'is_out', 'measurement', 'pause', 'paused_ns', 'name')
-
-    def __init__(self, pool: WorkerPool, thread: threading.Thread | None) -> None:
-        self.pool = pool
-        self.engine = pool.engine
-        self.thread = thread
-        self.name = 'visitor'
-        self.work: Work | None = None
-        self.worker = 0
-        self.permit = threading.Lock()
-        self.permit.acquire()
-        self.vtid = self.ident = 0
-        self.waits = self.has_lent = self.is_out = False
-        self.measurement: Measurement | None = None
-        self.pause: Pause | None = None
-        self.is_spare = False
-        self.state = ThreadState.RUNNING if thread is None else ThreadState.PARKED
-        self.published = self.start = self.end = self.waits_since = self.paused_ns = 0
-        self.outcome: Any = None
-
-    def begin(self) -> None:
-        """Note the ids of the calling thread."""
-        self.vtid, self.ident = threading.get_native_id(), threading.get_ident()
-
-    def is_short(self) -> bool:
-        """Return whether the thread runs a short callback that has its worker."""
-        work = self.work
-        return work is not None and not self.is_out and (
-            work.entity.wall_ns <= SHORT_CALLBACK_NS
-            or self.published > 0 and work.entity.tail_ns <= SHORT_CALLBACK_NS)
-
-    def wait_for_pause(self) -> None:
-        """Wait until the callback that this one has just overtaken has paused."""
-        pause, self.pause = self.pause, None
-        if pause is not None:
-            pause.wait_for_it()
-
-    def publishes(self, state: PublisherState, msg: Any) -> None:
-        """Note that the running callback publishes."""
-        topic, work, engine = state.topic, self.work, self.engine
-        if engine.notes_publications:
-            engine.publishes(work, topic, state.address, msg, self.pool.clock.now(), self.vtid)
-        if work is not None and topic not in work.entity.publishes:
-            work.entity.publishes.add(topic)
-        if not self.published:
-            self.published = monotonic_ns()
-
-    def lend(self) -> Any:
-        """Lend the worker while entered: the callback waits for a service, or spins."""
-        work = self.work
-        group = None if work is None else self.pool.outer_groups.get(work.entity.outer)
-        return self.pool.lend(self) if group is None else self._lend_in(group)
-
-    @contextmanager
-    def _lend_in(self, group: Any) -> Iterator[None]:
-        with group.nested(), self.pool.lend(self):
-            yield
-
-    @property
-    def job(self) -> tuple[str, int, int] | None:
-        """Return DAG, index and release of the job whose callback runs; None: no job."""
-        return None if self.work is None else self.engine.job_of(self.work)
 
 
 class WorkerPool:
@@ -236,9 +100,9 @@ class WorkerPool:
     ) -> None:
         self.engine = engine
         engine.allow_bypass()
-        self._is_recorded = engine.record is not None
+        self.is_recorded = engine.record is not None
         self.clock = clock
-        self._offset = clock.offset_ns
+        self.offset = clock.offset_ns
         # reentrant only to know its owner: a signal handler may run inside
         self.lock = engine_lock(self._validate, engine.size)
         # the last changes of threads: time, name, and new state
@@ -253,13 +117,10 @@ class WorkerPool:
         self.running = False
         self.stopped_at = 0
         self.is_current = False
-        # those that are overtaken, by their executions
-        self._pauses: dict[Work, Pause] = {}
+        self.pauses = Pauses(self)
         engine.interpreter.pauses = can_pause()
-        self.lent = 0
-        # the threads of executions that have lent their workers, and wait to go on
-        self._rejoining: dict[Work, WorkerThread] = {}
-        self._n_ended = 0
+        self.lending = Lending(self)
+        self.n_ended = 0
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None, int], bool] | None = None
         #: by number: see ``MultiDeadlineExecutor.new_outer_group``
@@ -285,7 +146,6 @@ class WorkerPool:
         # how many callbacks are known to wait, and may get messages or requests
         self._eager = 0
         self._polled_at = 0  # when the epoll was last polled
-        self._waiting_calls = 0
         self._bell_rings = self._has_called = False
         self._closed = False
         self._at_end: Callable[[], None] = _nothing
@@ -329,13 +189,13 @@ class WorkerPool:
 
     def tick(self) -> int:
         """Return the engine's time now; it never decreases.  The caller holds the lock."""
-        now = self.now = monotonic_ns() + self._offset
+        now = self.now = monotonic_ns() + self.offset
         return now
 
     def _timer_fired(self, fired: Fired) -> None:
         """Report a timer that is due to the engine; the caller holds the lock."""
         work, due, missed, period = fired
-        due += self._offset
+        due += self.offset
         now = self.tick()   # it may have become due since the turn began
         self.engine.timer_due(work, due, now)
         if missed:
@@ -394,16 +254,16 @@ class WorkerPool:
                 self.due.arm_by(
                     monotonic_ns() + (rest // 2 if step.holder is not None else rest))
         else:
-            self._wake_for(self.engine.look(self.now), self.now)
+            self.wake_for(self.engine.look(self.now), self.now)
 
-    def _wake_for(self, step: Step, now: int) -> None:
+    def wake_for(self, step: Step, now: int) -> None:
         """Wake a thread if it may start an execution, or check what that has to wait for."""
         if step.more:
-            self._call()
-        elif step.n_idle and step.holder is not None and self.engine.interpreter.is_wanted():
-            self.due.check.begin(now - self._offset)
+            self.call()
+        elif step.n_idle:
+            self.due.check.begin_if_wanted(now - self.offset)
 
-    def _call(self) -> None:
+    def call(self) -> None:
         """Wake a thread, which starts what may start, or waits for events."""
         if self.polling or self.is_stepping:
             if not self._bell_rings:
@@ -443,13 +303,13 @@ class WorkerPool:
             self.running = True
             self.is_stepping = False
             self.stopped_at = 0
-            self.due.begin(self.tick() - self._offset)
+            self.due.begin(self.tick() - self.offset)
             self.engine.stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:
                 self._new_thread()
             # one that did not leave after the last spin (``pause``) is asleep, and not parked
             self._bell_rings = self._has_called = False
-            self._call()
+            self.call()
 
     def pause(self) -> None:
         """Start no more executions; running ones finish.  No thread waits in the epoll then."""
@@ -457,7 +317,7 @@ class WorkerPool:
         try:
             with self.lock:
                 self.start_no_more()
-                self._let_go_on()
+                self.lending.let_go_on()
                 self.due.arm(0)
                 if not self.polling or self._leaving:
                     return
@@ -537,6 +397,11 @@ class WorkerPool:
                 break  # it is just being started
         return True
 
+    def need_threads(self, n_out: int) -> None:
+        """Make a thread if, without so many, there are fewer threads than workers."""
+        if len(self._threads) - n_out < self.engine.n_workers:
+            self._new_thread()
+
     def _new_thread(self) -> WorkerThread:
         me = WorkerThread(self, None)
         me.state = ThreadState.PARKED
@@ -569,7 +434,7 @@ class WorkerPool:
             with self.lock:
                 self._threads.remove(me)
                 if me.state is ThreadState.WAITING:  # it has failed
-                    self._become(me, ThreadState.PARKED)
+                    self.become(me, ThreadState.PARKED)
                 self._n_parked -= me.state is ThreadState.PARKED
                 is_last = self._closed and not self._threads
             if is_last:
@@ -578,12 +443,12 @@ class WorkerPool:
     def _work(self, me: WorkerThread) -> None:
         """Take turns until the pool is closed."""
         wait, park, receive, go_on, execute = (
-            self.loop.wait, self.parking.wait, self._receive, self._go_on, self._execute)
+            self.loop.wait, self.parking.wait, self._receive, self._go_on, me.execute)
         current.running = me
         found = False
         while True:
             if found:
-                execute(me)
+                execute()
                 found = go_on(me)
             elif me.state is ThreadState.PARKED:
                 park()
@@ -604,7 +469,7 @@ class WorkerPool:
         return [f'{(at - self.now) / 1e6:+.3f} ms {name} {state.value}'
                 for at, name, state in self._history if name]
 
-    def _become(self, me: WorkerThread, state: ThreadState) -> None:
+    def become(self, me: WorkerThread, state: ThreadState) -> None:
         """Change the state of a thread; the caller holds the lock."""
         before = me.state
         if before is state:
@@ -637,14 +502,14 @@ class WorkerPool:
         """
         with self.lock:
             # inlined tick: saves a call for each execution
-            now = self.now = monotonic_ns() + self._offset
+            now = self.now = monotonic_ns() + self.offset
             since = now
             if me.state is ThreadState.WAITING:
                 since = me.waits_since
                 self._polled_at = now
             if events is None:
                 self._has_called = False
-                self.due.has_looked(now - self._offset)
+                self.due.has_looked(now - self.offset)
                 self._look(now)
             else:
                 self._bell_rings = False  # the waiting thread may have received it
@@ -669,7 +534,7 @@ class WorkerPool:
             else:
                 self.loop.announce(source)  # for the next spin
         # a recorded message is later than the turn began
-        if self.running and self.due.is_due(self.now - self._offset):
+        if self.running and self.due.is_due(self.now - self.offset):
             self.due.handle(self.now, since)
 
     def _look(self, now: int) -> None:
@@ -678,7 +543,7 @@ class WorkerPool:
             self._polled_at = now
             self._collect(self.loop.poll(), now)
             if self.engine.interpreter.is_wanted():
-                self.due.check.begin_late(now - self._offset)
+                self.due.check.begin_late(now - self.offset)
 
     def _go_on(self, me: WorkerThread, is_last: bool = False) -> bool:
         """
@@ -689,30 +554,28 @@ class WorkerPool:
         """
         engine = self.engine
         with self.lock:
-            now = self.now = monotonic_ns() + self._offset
+            now = self.now = monotonic_ns() + self.offset
             work: Any = me.work
             if work is not None:
                 me.work = None
-                self._n_ended += 1
+                self.n_ended += 1
                 if me.outcome is None and not me.has_lent:
                     engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
-                    if engine.to_ask_again:
-                        engine.ask_again()
                 else:
                     self._report_unusual_end(me, work, now)
-                if self._rejoining and not self.running:
-                    self._let_go_on()
+                if self.lending.rejoining and not self.running:
+                    self.lending.let_go_on()
                 if work.entity.removed:
                     self.wake_executor()  # the registry can forget it now
                 if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:
                     self._look(now)
             if is_last:
-                self.due.arm(now - self._offset)
+                self.due.arm(now - self.offset)
                 if self._verdicts.missed != self._misses:
                     self._note_misses()
             found = not is_last and self._choose(me, self.now)
-            if self._pauses:
-                self.end_pauses()
+            if self.pauses.paused:
+                self.pauses.end()
         if self.unlocked_calls:
             self._make_unlocked_calls()
         return found
@@ -756,13 +619,12 @@ class WorkerPool:
 
     def _choose(self, me: WorkerThread, now: int) -> bool:
         """Set the next execution, or where to wait; return whether there is an execution."""
-        engine = self.engine
-        due = self.due
+        engine, due, rejoining = self.engine, self.due, self.lending.rejoining
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
         if self.running and not (self.is_stepping and me.thread is not None):
             step = engine.step(me.worker, now, self.polling > 0)
-            while self._rejoining and step.work in self._rejoining:
-                self._hand_over(step, now)
+            while rejoining and step.work in rejoining:
+                self.lending.hand_over(step)
                 step = engine.step(me.worker, now, self.polling > 0)
         else:
             step = engine.look(now, self.is_stepping)
@@ -775,67 +637,32 @@ class WorkerPool:
             if me.thread is not None:  # else a visitor: the thread of a spin_once
                 self._rest(me, step)
                 if self.is_stepping and step.more:
-                    self._call()
-            due.rest(now - self._offset)
+                    self.call()
+            due.rest(now - self.offset)
             return False
         me.work = work
         me.worker = work.worker
-        self._become(me, _RUNNING)
+        self.become(me, _RUNNING)
         if step.overtaken is not None:
-            self._pause(step.overtaken, me)
+            self.pauses.begin(step.overtaken, me)
         me.is_spare = not (step.is_short or step.holder is work)
         if step.deadline != due.overdue.deadline and (self.polling or not step.is_short):
             due.overdue.set(step.deadline)  # else there is time until it ends
         if self.is_stepping:
-            due.arm(now - self._offset)
+            due.arm(now - self.offset)
         elif self.polling:
             if step.more:
-                self._call()
+                self.call()
             elif self.agenda.first() < self.loop.timer.at:
-                due.arm(now - self._offset)
+                due.arm(now - self.offset)
         elif step.n_idle:
             if step.is_short:
-                due.look_after(now - self._offset, step.patience_ns)
+                due.look_after(now - self.offset, step.patience_ns)
             elif me.is_spare or self._eager or step.more:
-                self._call()
+                self.call()
             else:
-                due.look(now - self._offset)
+                due.look(now - self.offset)
         return True
-
-    def _pause(self, overtaken: Work, me: WorkerThread) -> None:
-        """Let the callback pause that an execution overtakes; the caller holds the lock."""
-        thread = self.thread_of(overtaken)
-        if thread is not None and overtaken not in self._pauses:
-            me.pause = self._pauses[overtaken] = Pause(thread)
-        # else the last one that overtook it has just ended
-
-    @property
-    def is_watched(self) -> bool:
-        """Return whether a paused thread checks the execution that holds the GIL."""
-        return any(pause.is_watching for pause in self._pauses.values())
-
-    def overtaker(self) -> tuple[Work | None, WorkerThread | None]:
-        """Return the execution that holds the GIL, and its thread."""
-        with self.lock:
-            holder = self.engine.interpreter.holder
-            return holder, None if holder is None else self.thread_of(holder)
-
-    def overtaker_waits(self, urgent: Work) -> None:
-        """Take the GIL from an execution that does not compute."""
-        with self.lock:
-            self.tick()
-            if self.engine.interpreter.holder is urgent:
-                self.engine.stop_holding(urgent)
-                self.end_pauses()
-                self.wake_for_more()
-
-    def end_pauses(self) -> None:
-        """Let those go on that are overtaken no more; the caller holds the lock."""
-        overtaken = self.engine.interpreter.overtaken
-        for work in [each for each in self._pauses if each not in overtaken]:
-            pause = self._pauses.pop(work)
-            work.paused_ns += self.now - self._offset - pause.since
-            pause.end()
 
     def _rest(self, me: WorkerThread, step: Step) -> None:
         """Let a thread without an execution wait for events, or park it."""
@@ -844,7 +671,7 @@ class WorkerPool:
         waits = self.running and not self.is_stepping and not self._closed and (
             self._eager > 0 or step.holder is None) and (
             others == 0 or me.is_spare and others < step.n_idle)
-        self._become(me, _WAITING if waits else _PARKED)
+        self.become(me, _WAITING if waits else _PARKED)
 
     def thread_of(self, work: Work) -> WorkerThread | None:
         """Return the thread that runs an execution."""
@@ -853,64 +680,6 @@ class WorkerPool:
 
     # --- executions ------------------------------------------------------------------------------
 
-    def _execute(self, me: WorkerThread) -> None:
-        """Run the thread's execution until it ends or waits."""
-        work: Any = me.work
-        entity = work.entity
-        habit, gate, group = entity.habit, entity.gate, entity.exclusive
-        must_check = not self.is_current or (
-            entity.may_be_gone and work.ready_ns != self.now)  # else it was just checked
-        measurement = None
-        if habit.rests < 1 or self._is_recorded:
-            measurement = Measurement(habit)
-        me.measurement = measurement
-        me.published = me.paused_ns = 0
-        if me.pause is not None:
-            me.wait_for_pause()
-        start = monotonic_ns()
-        try:
-            if group is not None and work.coroutine is None and (
-                    not group.beginning_execution(entity.rclpy_object)):
-                raise Refused
-            me.outcome = (
-                work.step(must_check) if gate is None else gate(work, must_check))
-        except Refused as error:
-            me.outcome = error
-            return
-        except BaseException as error:
-            me.outcome = from_user_code(error)
-        if group is not None and (
-                me.outcome is None or isinstance(me.outcome, BaseException)):
-            group.ending_execution(entity.rclpy_object)
-        end = monotonic_ns()
-        me.start, me.end = start + self._offset, end + self._offset
-        wall = end - start - me.paused_ns
-        if (measurement is None and not me.published
-                and entity.wall_ns <= SHORT_CALLBACK_NS >= wall):
-            habit.rests -= 1  # an average of short executions stays short without it
-        else:
-            self._note_times(me, work, measurement, wall)
-        if self.callback_ended is not None and not isinstance(me.outcome, BaseException):
-            self.callback_ended(entity.rclpy_object, None, entity.outer)
-
-    def _note_times(
-        self, me: WorkerThread, work: Work, measurement: Measurement | None, wall: int
-    ) -> None:
-        """Note how long the thread's execution took, and when it published."""
-        entity = work.entity
-        habit = entity.habit
-        if measurement is None:
-            habit.rests -= 1
-        else:
-            work.cpu_ns += measurement.end()
-        if wall > SHORT_CALLBACK_NS:
-            habit.rests = 0  # long callbacks are measured each time
-        entity.wall_ns += (wall - entity.wall_ns) >> 3 if entity.ran else wall - entity.wall_ns
-        self.note_eager(entity)
-        if me.published:
-            tail = me.end - self._offset - me.published
-            entity.tail_ns += (tail - entity.tail_ns) >> 3
-
     def _report_unusual_end(self, me: WorkerThread, work: Work, now: int) -> None:
         """Report an execution that was refused, waits, has failed, or has lent its worker."""
         engine, start, end = self.engine, me.start, me.end
@@ -918,12 +687,12 @@ class WorkerPool:
         me.outcome = None
         if me.has_lent:
             worker = -1
-            self._waiting_calls -= me.is_out
-            me.has_lent = me.is_out = False
+            self.lending.is_back(me)
+            me.has_lent = False
         if isinstance(outcome, Refused):
             engine.refused(work, now)
             self.due.call_at(
-                now - self._offset + AGAIN_NS, partial(self.report, lambda _: engine.ask_again()))
+                now - self.offset + AGAIN_NS, partial(self.report, lambda _: engine.ask_again()))
             return
         if outcome is None:
             engine.finished(work, start, end, now, me.vtid, worker)
@@ -942,7 +711,6 @@ class WorkerPool:
                 self.fail(outcome)  # at once: the spin may be about to end
             elif not is_gone:
                 self.unlocked_calls.append(partial(self._report_error, work, outcome))
-        engine.ask_again()
 
     def _report_error(self, work: Work, error: BaseException) -> None:
         if self.callback_ended is None or not self.callback_ended(
@@ -968,104 +736,6 @@ class WorkerPool:
             return
         work.coroutine.suspended(resume)
 
-    @contextmanager
-    def lend(self, me: WorkerThread) -> Iterator[None]:
-        """Lend the worker of a running callback to other threads."""
-        lends = False
-        if me.work is not None and me.work.coroutine is not None:
-            me.work.coroutine.let_others()
-        with self.lock:
-            if not me.is_out and me.work is not None and self._waiting_calls < MOST:
-                lends = me.has_lent = me.is_out = True
-                self._waiting_calls += 1
-                self.lent += 1
-                self.tick()
-                self._become(me, ThreadState.OUT)
-                self.engine.lend(me.work)
-                self.end_pauses()
-                free = len(self._threads) - self._waiting_calls
-                if me.thread is not None and self.running and free < self.engine.n_workers:
-                    self._new_thread()
-                if self.polling:
-                    self.wake_for_more()
-                else:
-                    self._call()
-        measurement = me.measurement if lends else None
-        if measurement is not None:
-            measurement.pause()
-        waits_before, me.waits = me.waits, me.is_out
-        try:
-            executor = self.executor if me.thread is None else None
-            with nullcontext() if executor is None else executor.serve_meanwhile():
-                yield
-        finally:
-            me.waits = waits_before
-            if lends and me.thread is not None:
-                self._rejoin(me)
-            if measurement is not None:
-                measurement.resume()
-
-    def _rejoin(self, me: WorkerThread) -> None:
-        """Wait until the callback of the calling thread, which has lent its worker, may go on."""
-        engine = self.engine
-        work: Any = me.work
-        with self.lock:
-            now = self.tick()
-            if not self.running:
-                return
-            is_first = engine.rejoin(work, now)
-            self._rejoining[work] = me
-            # what waits already is chosen by another thread, as this one cannot run it
-            step = engine.step(me.worker, now) if is_first else engine.look(now)
-            if step.work is not None:
-                self._hand_over(step, now)
-            if self.polling:
-                self._wake_for(step, now)
-            else:
-                self._call()
-            seen = self._n_ended, process_time_ns()
-        while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
-            with self.lock:
-                before, seen = seen, (self._n_ended, process_time_ns())
-                if work in self._rejoining and engine.waits_for_place(work) and (
-                        self.now - now < ALONE_NS):
-                    self.tick()     # it is not to overlap with the one that has its place
-                elif (work in self._rejoining and before[0] == seen[0]
-                        and seen[1] - before[1] < REJOIN_NS // 10):
-                    self._go_on_without(work)
-        me.wait_for_pause()
-
-    def _hand_over(self, step: Step, now: int) -> None:
-        """Let an execution go on that was dispatched again; the caller holds the lock."""
-        work: Any = step.work
-        thread = self._rejoining.pop(work)
-        self._become(thread, ThreadState.RUNNING)
-        thread.worker = work.worker
-        thread.is_out = False
-        self._waiting_calls -= 1
-        if step.overtaken is not None:
-            self._pause(step.overtaken, thread)
-        thread.permit.release()
-        if self.engine.interpreter.is_wanted():
-            self.due.check.begin(now - self._offset)
-
-    def _go_on_without(self, work: Work) -> None:
-        """Let an execution go on without a worker; the caller holds the lock."""
-        self.engine.go_on_without(work)
-        thread = self._rejoining.pop(work)
-        self._become(thread, ThreadState.RUNNING)
-        thread.permit.release()
-
-    def _let_go_on(self) -> None:
-        """
-        Let the executions go on that wait for their workers; the caller holds the lock.
-
-        Of an outer group they go on one after the other.
-        """
-        for work in list(self._rejoining):
-            if not self.engine.waits_for_place(work):
-                self._go_on_without(work)
-
     # --- spin_once -------------------------------------------------------------------------------
 
     @contextmanager
@@ -1077,14 +747,14 @@ class WorkerPool:
         finally:
             with self.lock:
                 self.running = self.is_stepping = False
-                self._let_go_on()
+                self.lending.let_go_on()
 
     def resume_stepping(self) -> None:
         """Continue as in ``stepping``, after ``start`` and ``pause``."""
         with self.lock:
             self.running = self.is_stepping = True
             self.stopped_at = 0
-            self.due.begin(self.tick() - self._offset)
+            self.due.begin(self.tick() - self.offset)
 
     def run_one(self, events: Events) -> bool:
         """Collect arrivals, and run one execution in the calling thread, if there is one."""
@@ -1097,7 +767,7 @@ class WorkerPool:
         try:
             found = self._receive(me, events)
             while found:
-                self._execute(me)
+                me.execute()
                 is_refused = isinstance(me.outcome, Refused)
                 self._go_on(me, is_last=True)
                 if not is_refused:

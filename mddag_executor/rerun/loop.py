@@ -342,8 +342,6 @@ class Loop:
             self._resume_when_done(work, waits_for)
         for leave, _ in execution.sent:
             leave(*origin)
-        if engine.to_ask_again:
-            engine.ask_again()
 
     def _origin_of(self, execution: Execution) -> tuple[Origin | None, int]:
         """Return the job of what an execution publishes, and its release."""

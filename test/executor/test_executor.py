@@ -7,11 +7,11 @@ import threading
 import time
 
 from builtin_interfaces.msg import Time
-from mddag_executor.executor import workers
+from mddag_executor.executor import threads
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.tasks import TaskEntity
+from mddag_executor.executor.threads import WorkerThread
 from mddag_executor.executor.work import current, Work
-from mddag_executor.executor.workers import WorkerThread
 import pytest
 from rclpy.callback_groups import (
     CallbackGroup,
@@ -204,7 +204,7 @@ def test_a_rate_that_is_found_before_it_has_its_callback_ends_a_sleep(make_execu
 def test_one_slow_execution_does_not_make_a_callback_long(make_executor, monkeypatch):
     """Each execution counts the same; short ones are measured seldom."""
     pool, now, takes = make_executor()._pool, [10**12], [10_000]
-    monkeypatch.setattr(workers, 'monotonic_ns', lambda: now[0])
+    monkeypatch.setattr(threads, 'monotonic_ns', lambda: now[0])
     entity = TaskEntity()
     thread = WorkerThread(pool, None)
 
@@ -213,7 +213,7 @@ def test_one_slow_execution_does_not_make_a_callback_long(make_executor, monkeyp
 
     def execute():
         thread.work = Work(entity, run)
-        pool._execute(thread)
+        thread.execute()
         entity.ran += 1
 
     for _ in range(100):

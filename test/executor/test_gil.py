@@ -308,7 +308,8 @@ class PausedHere:
 
     def __init__(self, is_inside):
         self.calls = []
-        self.ident, self.paused_ns, self.pool = threading.get_ident(), 0, self
+        self.ident, self.paused_ns = threading.get_ident(), 0
+        self.pool = self.pauses = self
         self.measurement = SimpleNamespace(
             pause=partial(self.calls.append, 'pause'), resume=partial(self.calls.append, 'resume'))
         self.is_inside = lambda: is_inside

@@ -157,7 +157,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_gil.py', 'test_a_task_holds_the_gil_if_its_function_does[False]',
         'test_a_task_holds_the_gil_if_its_function_does[True]'), every=True),
     Case('those_that_go_on_wait_for_ever', [(
-        'executor/workers.py', 'self._go_on_without(work)', 'pass')], of(
+        'executor/lending.py', 'self._go_on_without(work)', 'pass')], of(
         'test_gil.py', 'test_workers_that_wait_for_a_callback_do_not_keep_it_waiting')),
     Case('what_bypasses_the_core_stays_unknown', [(
         'executor/engine.py', 'self._start_next(work.worker, self._bypassing_since)', 'pass')],
@@ -198,12 +198,12 @@ client.completed = getattr(client, 'completed', 0) + 1
         'executor/pausing.py', 'pause.take()', 'pass')], of(
         'test_gil.py', 'test_a_callback_pauses_while_a_more_urgent_one_computes[here]')),
     Case('paused_callbacks_wait_for_ever', [(
-        'executor/pausing.py', 'pool.overtaker_waits(work)', 'pass')], of(
+        'executor/pausing.py', 'pauses.overtaker_waits(work)', 'pass')], of(
         'test_gil.py', 'test_a_callback_that_owns_a_lock_does_not_pause_for_ever[here-user]')),
     Case('nobody_looks', [(
         'executor/workers.py', """\
-self.due.has_looked(now - self._offset)
-                self._look(now)""", 'self.due.has_looked(now - self._offset)')], of(
+self.due.has_looked(now - self.offset)
+                self._look(now)""", 'self.due.has_looked(now - self.offset)')], of(
         'test_gil.py',
         'test_arrivals_with_an_earlier_deadline_overtake_and_others_wait[elsewhere]')),
     Case('add_node_does_not_wake', [(

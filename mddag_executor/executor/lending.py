@@ -1,0 +1,188 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Callbacks that wait inside ``Client.call``: they lend their workers, and rejoin.
+
+Theory of operation
+-------------------
+A callback that waits inside ``Client.call`` returns its worker to the core.  If fewer threads are
+left than there are workers, a thread is made.  At most ``MOST`` callbacks lend at the same time;
+further ones keep their workers.  When it has its answer, it *rejoins*: it waits in the core like
+any other execution, and its thread waits for its permit.  The thread that dispatches it hands its
+worker over, and chooses again.  All workers may run callbacks that wait for this one (it may own a
+lock).  So if in ``REJOIN_NS`` no execution has ended, and the process has computed nothing, it
+goes on without a worker; as it does when a spin ends, or in ``spin_once``, where only one callback
+runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from time import process_time_ns
+from typing import Any, Protocol
+
+from mddag_executor.executor.bounds import ALONE_NS, MOST, REJOIN_NS
+from mddag_executor.executor.due import DueTimes
+from mddag_executor.executor.engine import Engine, Step
+from mddag_executor.executor.hall import Spinner
+from mddag_executor.executor.pausing import Pauses
+from mddag_executor.executor.threads import ThreadState, WorkerThread
+from mddag_executor.executor.work import Work
+
+
+class Pool(Protocol):
+    """The worker pool, as lending sees it: see ``workers.WorkerPool``."""
+
+    engine: Engine
+    due: DueTimes
+    pauses: Pauses
+    lock: Any
+    running: bool
+    offset: int
+    now: int
+    n_ended: int
+
+    @property
+    def executor(self) -> Spinner | None:
+        """Return the executor; None: it has been destroyed."""
+
+    @property
+    def polling(self) -> int:
+        """Return how many threads wait for events."""
+
+    def tick(self) -> int:
+        """Return the engine's time now."""
+
+    def become(self, me: WorkerThread, state: ThreadState) -> None:
+        """Change the state of a thread."""
+
+    def need_threads(self, n_out: int) -> None:
+        """Make a thread if, without so many, there are fewer threads than workers."""
+
+    def call(self) -> None:
+        """Wake a thread."""
+
+    def wake_for(self, step: Step, now: int) -> None:
+        """Wake a thread if it may start an execution."""
+
+    def wake_for_more(self) -> None:
+        """Wake a thread if an idle worker may start an execution."""
+
+
+class Lending:
+    """
+    The callbacks without a worker; methods with ``the lock`` need the engine's.
+
+    :ivar n_lent: how many times a worker was lent.
+    :ivar n_out: how many callbacks have lent their workers now.
+    :ivar rejoining: the threads of executions that wait to go on; needs the lock.
+    """
+
+    def __init__(self, pool: Pool) -> None:
+        self._pool = pool
+        self.n_lent = 0
+        self.n_out = 0
+        self.rejoining: dict[Work, WorkerThread] = {}
+
+    @contextmanager
+    def lend(self, me: WorkerThread) -> Iterator[None]:
+        """Lend the worker of a running callback to other threads."""
+        pool = self._pool
+        lends = False
+        if me.work is not None and me.work.coroutine is not None:
+            me.work.coroutine.let_others()
+        with pool.lock:
+            if not me.is_out and me.work is not None and self.n_out < MOST:
+                lends = me.has_lent = me.is_out = True
+                self.n_out += 1
+                self.n_lent += 1
+                pool.tick()
+                pool.become(me, ThreadState.OUT)
+                pool.engine.lend(me.work)
+                pool.pauses.end()
+                if me.thread is not None and pool.running:
+                    pool.need_threads(self.n_out)
+                if pool.polling:
+                    pool.wake_for_more()
+                else:
+                    pool.call()
+        measurement = me.measurement if lends else None
+        if measurement is not None:
+            measurement.pause()
+        waits_before, me.waits = me.waits, me.is_out
+        try:
+            executor = pool.executor if me.thread is None else None
+            with nullcontext() if executor is None else executor.serve_meanwhile():
+                yield
+        finally:
+            me.waits = waits_before
+            if lends and me.thread is not None:
+                self._rejoin(me)
+            if measurement is not None:
+                measurement.resume()
+
+    def _rejoin(self, me: WorkerThread) -> None:
+        """Wait until the callback of the calling thread, which has lent its worker, may go on."""
+        pool = self._pool
+        engine = pool.engine
+        work: Any = me.work
+        with pool.lock:
+            now = pool.tick()
+            if not pool.running:
+                return
+            is_first = engine.rejoin(work, now)
+            self.rejoining[work] = me
+            # what waits already is chosen by another thread, as this one cannot run it
+            step = engine.step(me.worker, now) if is_first else engine.look(now)
+            if step.work is not None:
+                self.hand_over(step)
+            if pool.polling:
+                pool.wake_for(step, now)
+            else:
+                pool.call()
+            seen = pool.n_ended, process_time_ns()
+        while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
+            with pool.lock:
+                before, seen = seen, (pool.n_ended, process_time_ns())
+                if work in self.rejoining and engine.waits_for_place(work) and (
+                        pool.now - now < ALONE_NS):
+                    pool.tick()     # it is not to overlap with the one that has its place
+                elif (work in self.rejoining and before[0] == seen[0]
+                        and seen[1] - before[1] < REJOIN_NS // 10):
+                    self._go_on_without(work)
+        me.wait_for_pause()
+
+    def hand_over(self, step: Step) -> None:
+        """Let an execution go on that was dispatched again; the caller holds the lock."""
+        work: Any = step.work
+        pool, thread = self._pool, self.rejoining.pop(work)
+        pool.become(thread, ThreadState.RUNNING)
+        thread.worker = work.worker
+        self.is_back(thread)
+        if step.overtaken is not None:
+            pool.pauses.begin(step.overtaken, thread)
+        thread.permit.release()
+        pool.due.check.begin_if_wanted(pool.now - pool.offset)
+
+    def is_back(self, thread: WorkerThread) -> None:
+        """Note that a thread has a worker again, or its callback has ended; needs the lock."""
+        self.n_out -= thread.is_out
+        thread.is_out = False
+
+    def _go_on_without(self, work: Work) -> None:
+        """Let an execution go on without a worker; the caller holds the lock."""
+        self._pool.engine.go_on_without(work)
+        thread = self.rejoining.pop(work)
+        self._pool.become(thread, ThreadState.RUNNING)
+        thread.permit.release()
+
+    def let_go_on(self) -> None:
+        """
+        Let the executions go on that wait for their workers; the caller holds the lock.
+
+        Of an outer group they go on one after the other.
+        """
+        for work in list(self.rejoining):
+            if not self._pool.engine.waits_for_place(work):
+                self._go_on_without(work)
