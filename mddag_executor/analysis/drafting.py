@@ -108,7 +108,8 @@ class System:
         if not self._entities:
             raise InputError(
                 self.name, 'no timer, subscription or service of a node is recorded in it',
-                'also record the start of the nodes')
+                'record the start of the nodes as well; actions and parameters, if nodes have '
+                'nothing else, cannot be declared')
         # by callback's number
         numbers, index = recording.callbacks()
         self._declared: dict[int, Declared] = {

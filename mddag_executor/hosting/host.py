@@ -18,6 +18,7 @@ Theory of operation
    its ``shutdown``                   called by a program's thread, ends that program; called by
                                       any other thread (in a callback), ends the run
    its ``ok``                         is also False in the threads of a program that has ended
+   ``Node.create_timer``, …           note that the program uses the node
    ``Executor.__init__``              makes a ``GuestExecutor`` of the executor
    ``get_global_executor``            returns a ``GuestExecutor`` of the calling program
    ``EventsExecutor``                 makes a ``GuestExecutor``
@@ -28,7 +29,8 @@ Theory of operation
 
 3. A program that spins passes its nodes to the host's executor and waits until the run or the
    program ends.  A program ends by ``rclpy.shutdown`` or when it returns.  Its nodes are then
-   removed, unless it has returned them.  The run ends when the last main has returned.
+   removed, unless it has returned them, or another program uses them (the node of a library).
+   The run ends when the last main has returned.
    If a SIGINT ends the run, the spin of the program in the main thread raises KeyboardInterrupt
    when no callback runs any more, as do those in the threads of the other mains.
 4. Callbacks of a program run only while it spins, and as many at a time as its own executor would
@@ -81,6 +83,8 @@ _SIGNALS_OF = {
     SignalHandlerOptions.SIGINT: (signal.SIGINT,),
     SignalHandlerOptions.SIGTERM: (signal.SIGTERM,)}
 
+_MAKE_CALLBACKS = (
+    'create_subscription', 'create_timer', 'create_service', 'create_client', 'add_waitable')
 Result = TypeVar('Result')
 
 
@@ -112,6 +116,8 @@ class Host:
         self._executor_of_group: Any = weakref.WeakValueDictionary()
         self._opened: Any = weakref.WeakKeyDictionary()  # the program of each group
         self._of_callbacks: Any = weakref.WeakSet()  # threads
+        # the programs that have made subscriptions, timers, … of a node
+        self._users: Any = weakref.WeakKeyDictionary()
         # the node behind each object that a program has added as a node
         self._behind: Any = weakref.WeakKeyDictionary()
         self._signals = signals or Signals()
@@ -139,6 +145,8 @@ class Host:
         replace(Executor, '__init__', self._executor_init)
         replace(Context, 'init', self._init_other)
         replace(threading.Thread, 'start', self._thread_start)
+        for name in _MAKE_CALLBACKS:
+            replace(Node, name, self._of_user)
         for package in ('rclpy.experimental', 'rclpy.experimental.events_executor'):
             with suppress(ImportError, KeyError):  # some versions do not have it
                 replace(import_module(package), 'EventsExecutor', instead(SingleThreadedExecutor))
@@ -349,13 +357,23 @@ class Host:
         if not self._ended:
             for node in list(guest.nodes):
                 try:
-                    self.executor.remove_node(node)
+                    self._leave_node(node, guest)
                 except Exception as error:  # the program's own code, which must not keep the run
                     guest.error = guest.error or error
             self._end_run_after_last()
         self.wake()
         if guest.error is not None:
             self.program_failed(guest, guest.error)
+
+    def _leave_node(self, node: Node, guest: Guest) -> None:
+        """Remove a program's node; one that another program uses as well is that one's now."""
+        heir = next((each for each in self._users.get(node, ()) if not each.ended), None)
+        if heir is None:
+            self.executor.remove_node(node)
+            return
+        self.put(node, None)  # no spin excludes anything any more
+        guest.nodes.remove(node)
+        heir.nodes.append(node)
 
     def program_failed(self, guest: Guest, error: BaseException) -> None:
         """Report a program's exception at once, if other programs continue."""
@@ -578,6 +596,15 @@ class Host:
         """Return the program that the calling thread belongs to, or None."""
         guest: Guest | None = self.guest_of.get(threading.current_thread())
         return guest
+
+    def _of_user(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        def make(node: Node, *args: Any, **more: Any) -> Any:
+            guest = self.current_guest()
+            if guest is not None:
+                self._users.setdefault(node, {})[guest] = None
+            return original(node, *args, **more)
+
+        return make
 
     def _thread_start(self, original: Callable[..., None]) -> Callable[..., None]:
         def start(thread: threading.Thread) -> None:

@@ -21,6 +21,7 @@ from mddag_executor.report.tables import (
 from mddag_executor.report.text import listed, printable
 from mddag_executor.text import counted
 
+_DECLARED_KINDS = ('timer', 'subscription', 'service')
 SHOWN_NS = 10_000_000
 """Less waiting for other callbacks of the program is not worth a line."""
 
@@ -83,13 +84,19 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
             yield (f'trace: {printable(str(Path(trace["path"]).absolute()))}'
                    + (f' ({counted(lost, "event")} lost: {why})' if lost else ''))
     if not result['dags'] and result['trace'] is not None:
-        path = printable(result['trace']['path'])
-        yield (f'to judge it: mddag graph from-trace {path} --accept -o graph.yaml, then '
-               f'mddag replay {path} graph.yaml')
+        yield _next_step(printable(result['trace']['path']), callbacks)
     for process in result.get('processes', ()):
         if process['died']:
             yield printable(f'process {process["name"]} {process["how"]}: '
                             f'{process["said"] or "it said nothing"}')
+
+
+def _next_step(path: str, callbacks: dict[str, Any]) -> str:
+    if any(each['kind'] in _DECLARED_KINDS for each in callbacks.values()):
+        return (f'to judge it: mddag graph from-trace {path} --accept -o graph.yaml, then '
+                f'mddag replay {path} graph.yaml')
+    return ('there is nothing to judge: the nodes have no timer, subscription or service, and '
+            'actions and parameters cannot be declared')
 
 
 def _never_ran(result: dict[str, Any], reported: Collection[str]) -> Iterator[str]:

@@ -128,6 +128,15 @@ def test_unmodified_programs_run_on_our_executor(world):
 def test_a_run_ends_with_its_last_program(world, mddag):
     done = mddag('run', '-q', '--node', 'chat:never_spins')
     assert (done.returncode, done.stdout, done.stderr) == (0, 'typed w\n', '')
+    done = mddag('run', '--node', 'chat:never_spins', '--trace', 'typed.mcap')
+    assert 'there is nothing to judge: ' in done.stdout and 'from-trace' not in done.stdout
+
+
+def test_a_node_of_a_library_stays_as_long_as_a_program_uses_it(world, mddag):
+    done = mddag('run', '-q', '--node', 'chat:uses_a_library_briefly',
+                 '--node', 'chat:uses_a_library')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert done.stdout == 'heard after the end of the other program: True\n'
 
 
 def test_what_a_node_raises_while_it_is_removed_ends_the_run(world, mddag):

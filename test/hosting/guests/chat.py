@@ -349,6 +349,46 @@ def has_a_loop():
     never_spins()
 
 
+class Library:
+    """Has one node for all programs of a process, as some libraries do."""
+
+    node = None
+    long_program_has_begun = threading.Event()
+    short_program_has_ended = threading.Event()
+
+    @classmethod
+    def subscribe(cls, topic, heard):
+        if cls.node is None:
+            cls.node = Node('library')
+            executor = MultiThreadedExecutor(2)
+            executor.add_node(cls.node)
+            threading.Thread(target=executor.spin, daemon=True).start()
+        cls.node.create_subscription(String, topic, heard, 10)
+        return cls.node.create_publisher(String, topic, 10)
+
+
+def uses_a_library_briefly():
+    rclpy.init()
+    Library.subscribe('short', lambda message: None)
+    Library.long_program_has_begun.wait(30.0)
+    rclpy.shutdown()
+    Library.short_program_has_ended.set()
+
+
+def uses_a_library():
+    rclpy.init()
+    heard = threading.Event()
+    publisher = Library.subscribe('long', lambda message: heard.set())
+    Library.long_program_has_begun.set()
+    Library.short_program_has_ended.wait(30.0)
+    for _ in range(300):
+        publisher.publish(String())
+        if heard.wait(0.1):
+            break
+    print(f'heard after the end of the other program: {heard.is_set()}')
+    rclpy.shutdown()
+
+
 # --- how a run ends ------------------------------------------------------------------------------
 
 
