@@ -195,7 +195,7 @@ class _Links:
             raise error('period', 'a sync callback joins topics, so it cannot be a source',
                         "remove 'period:' and declare the publishers of its topics, or say which "
                         "topic drives it: 'sync: {topics: [...], driven_by: ...}'")
-        if not is_source:
+        if not is_source and any(topic in self.publishers for topic in callback.triggers):
             self._check_keys(callback, ('sink',), 'a topic of this graph starts this one',
                              'move it to the source callback')
         for topic in callback.triggers:

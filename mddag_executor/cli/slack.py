@@ -22,7 +22,7 @@ from mddag_executor.errors import UsageError
 from mddag_executor.output_rules import is_declaration
 
 if TYPE_CHECKING:
-    from mddag_executor.results.sinks import DagCounts
+    from mddag_executor.results.sinks import DagCounts, Requirements
     from mddag_executor.whatif.slack import Problem
     from msg_graph import TaskSet
 
@@ -59,17 +59,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    from mddag_executor.core.requirements import not_met
     from mddag_executor.core.tolerances import NOTHING_DUE
     from mddag_executor.report.slack import lines, page
     from mddag_executor.whatif.slack import find_slack, slack_result
     common.recording_and_graph(args)
     is_graph = is_declaration(str(args.trace))
-    problem, task_set, dags = (_of_graph if is_graph else _of_trace)(args)
-    common.leave_out_paths('slack', task_set)
+    problem, task_set, dags, required = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
     with Progress('searching', callbacks) as line:
         slack = find_slack(problem, line.update, args.parallel or defaults.processors())
-    result = slack_result(slack, task_set, dags, problem.settings.processes)
+    result = slack_result(slack, task_set, dags, problem.settings.processes, required)
     if args.report is not None:
         common.write_text(args.report, ''.join(page(result, str(args.trace))))
     common.show(args, result, lines(result))
@@ -78,12 +78,14 @@ def main(args: argparse.Namespace) -> int:
     if not total(dags).due:
         return verdicts.unproven(
             str(args.trace), NOTHING_DUE, 'give a longer run, or a longer --duration')
-    return int(bool(result['missed']) or any(
+    return int(bool(result['missed']) or bool(not_met(required)) or any(
         one['factor'] is not None and one['factor'] < args.fail_under
         for one in result['callbacks'].values()))
 
 
-def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, DagCounts]]:
+def _of_trace(
+    args: argparse.Namespace,
+) -> tuple[Problem, TaskSet, dict[str, DagCounts], Requirements]:
     from mddag_executor.whatif.reschedule import reschedule
     from mddag_executor.whatif.slack import Problem
     options.reject_options(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
@@ -100,13 +102,17 @@ def _of_trace(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Dag
     work = outcome.work
     problem = Problem(work.load, outcome.settings, outcome.tables,
                       outcome.task_set.places_of_vertices(), work.dispatches)
-    return problem, outcome.task_set, outcome.result()['dags']
+    result = outcome.result()
+    return problem, outcome.task_set, result['dags'], result.get('requirements', {})
 
 
-def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, DagCounts]]:
+def _of_graph(
+    args: argparse.Namespace,
+) -> tuple[Problem, TaskSet, dict[str, DagCounts], Requirements]:
     from mddag_executor.core import Tables
     from mddag_executor.simulate import periodic_load, Settings
     from mddag_executor.simulate import simulate as simulated
+    from mddag_executor.whatif.computed import ComputedRun
     from mddag_executor.whatif.slack import Problem
     if args.graph is not None:
         raise UsageError(f'{args.graph}: there is a declaration already: give one, or a trace '
@@ -122,6 +128,8 @@ def _of_graph(args: argparse.Namespace) -> tuple[Problem, TaskSet, dict[str, Dag
         duration_ns=args.duration or defaults.DURATION_NS, preemptive=bool(args.preemptive),
         cpus=args.cpus)
     load = periodic_load(task_set, times, settings.duration_ns)
-    run = simulated(task_set, load, settings)
+    requires = any(path.requirements for path in task_set.paths)
+    run = simulated(task_set, load, settings, log=requires)
     problem = Problem(load, settings, Tables.build(task_set), task_set.places_of_vertices())
-    return problem, task_set, run.result()['dags']
+    required = ComputedRun.of_run(task_set, load, run).requirements() if requires else {}
+    return problem, task_set, run.result()['dags'], required.get('requirements', {})

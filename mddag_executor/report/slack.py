@@ -16,6 +16,8 @@ from mddag_executor.text import counted
 
 _QUESTION = 'How much longer each callback may take'
 _MARGINS = 'sink', 'deadline', 'least margin', 'of it', '99 % have', 'median'
+_PATHS = 'path', 'required', *_MARGINS[2:]
+_PATHS_TITLE = 'How much less than required the paths take now'
 
 
 def lines(result: Mapping[str, Any]) -> Iterator[str]:
@@ -30,7 +32,11 @@ def lines(result: Mapping[str, Any]) -> Iterator[str]:
         yield table(('callback', 'may take', 'then misses'), rows)
     yield 'How long before their deadlines the sinks complete now:'
     yield table(_MARGINS, [
-        [short[name], *_margins(sink)] for name, sink in _least_first(result)])
+        [short[name], *_margins(sink)] for name, sink in _least_first(result['sinks'])])
+    if 'requirements' in result:
+        yield f'{_PATHS_TITLE} (the factors above are those of the sinks):'
+        yield table(_PATHS, [[name, *_margins(path)]
+                             for name, path in _least_first(result['requirements'])])
     yield from _summary(result)
 
 
@@ -112,7 +118,11 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
         for name, one in _tightest(result)], 2) + '</div>'
     yield '<h2>Margins of the sinks</h2>\n'
     yield html_table(_MARGINS, [(short[name], *_margins(sink))
-                                for name, sink in _least_first(result)], 1)
+                                for name, sink in _least_first(result['sinks'])], 1)
+    if 'requirements' in result:
+        yield f'<h2>{_PATHS_TITLE}</h2>\n'
+        yield html_table(_PATHS, [(name, *_margins(path))
+                                  for name, path in _least_first(result['requirements'])], 1)
     yield '</body></html>\n'
 
 
@@ -125,13 +135,13 @@ def _tightest(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
                    if one['factor']), key=lambda item: item[1]['factor'])
 
 
-def _least_first(result: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Return the sinks by margin as a share of the deadline, the least first."""
+def _least_first(sinks: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Return sinks by margin as a share of the deadline, the least first."""
     def share(item: tuple[str, Any]) -> float:
         margin = item[1]['margin_ns']
         return float('-inf') if margin is None else margin['min'] / item[1]['relative_deadline_ns']
 
-    return sorted(result['sinks'].items(), key=share)
+    return sorted(sinks.items(), key=share)
 
 
 def _times(factor: float) -> str:

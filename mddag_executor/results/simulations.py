@@ -151,7 +151,14 @@ class SinkMargin(TypedDict):
     """The time that is left to the deadline now; null if nothing completed."""
 
 
-class SlackResult(TypedDict):
+class SlackResultRare(TypedDict, total=False):
+    """Keys of the result of `slack` that are only there if something is required of paths."""
+
+    requirements: dict[str, SinkMargin]
+    """By requirement, called `PATH reaction` or `PATH age`, its margin."""
+
+
+class SlackResult(SlackResultRare):
     """The result of `slack`: how much longer callbacks may take."""
 
     most: float

@@ -41,9 +41,15 @@ from typing import Any, NamedTuple
 from mddag_executor.analysis.as_recorded import slack as margin
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
+from mddag_executor.core.requirements import as_dags
 from mddag_executor.core.state import Decision, SINK_IN_TIME
-from mddag_executor.results.simulations import FewerResult, SlackFactor, SlackResult
-from mddag_executor.results.sinks import DagCounts
+from mddag_executor.results.simulations import (
+    FewerResult,
+    SinkMargin,
+    SlackFactor,
+    SlackResult,
+)
+from mddag_executor.results.sinks import DagCounts, Requirements, SinkCounts
 from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
@@ -347,12 +353,14 @@ def find_slack(
 
 
 def slack_result(
-    slack: Slack, task_set: TaskSet, dags: Mapping[str, DagCounts], processes: int = 1
+    slack: Slack, task_set: TaskSet, dags: Mapping[str, DagCounts], processes: int = 1,
+    requirements: Requirements | None = None,
 ) -> SlackResult:
     """
     Return the result format of ``slack --json``.
 
-    :param dags: of the result of the run with factor 1.
+    :param dags: of the result of the run with factor 1; ``requirements``: its paths, if something
+        is required of them.
     :param processes: number of processes, each with so many workers.
     """
     names = [vertex.name for vertex in task_set.vertices]
@@ -368,7 +376,11 @@ def slack_result(
         return None if fewer is None else {
             'given': fewer.given, 'least': fewer.least, 'breaks': named(fewer.breaks)}
 
-    return {
+    def margins(sinks: Mapping[str, SinkCounts]) -> dict[str, SinkMargin]:
+        return {name: {'relative_deadline_ns': sink['relative_deadline_ns'],
+                       'margin_ns': margin(sink)} for name, sink in sinks.items()}
+
+    result: SlackResult = {
         'most': MOST,
         'processes': processes,
         'callbacks': {callback.key: shown(slack.factors[i])
@@ -377,9 +389,13 @@ def slack_result(
         'workers': enough(slack.fewer['workers']), 'cpus': enough(slack.fewer['cpus']),
         'missed': {names[sink]: slack.missed[sink] for sink in sorted(slack.missed)},
         'left_out': [names[sink] for sink in slack.left_out],
-        'sinks': {name: {'relative_deadline_ns': sink['relative_deadline_ns'],
-                         'margin_ns': margin(sink)}
-                  for dag in dags.values() for name, sink in dag['sinks'].items()}}
+        'sinks': {name: one for dag in dags.values()
+                  for name, one in margins(dag['sinks']).items()}}
+    if requirements:
+        result['requirements'] = {
+            name: one for path in as_dags(requirements).values()
+            for name, one in margins(path['sinks']).items()}
+    return result
 
 
 def _start() -> None:

@@ -47,6 +47,29 @@ def test_by_hand(tmp_path, call):
     assert call('slack', graph, '--fail-under', 3.6).returncode == 1
 
 
+def test_the_margins_of_paths(tmp_path, call):
+    """An input is the output of 3 ms later; a change right after it is in that of 13 ms later."""
+    graph, trace, page = (tmp_path / name for name in ('g.yaml', 't.mcap', 's.html'))
+    graph.write_text(BY_HAND + "paths: [{name: p, callbacks: ['/a:first', '/b:last'], "
+                     'reaction: 20ms, age: 2ms}]\n')
+    call('simulate', graph, '--trace', trace, '--duration', '1s')
+    for given in graph, trace:
+        done = call('slack', given, '--fail-under', 1, '--report', page, '--json', '-')
+        result = json.loads(done.stdout)
+        assert (done.returncode, result['missed']) == (1, {})     # the age is not met
+        assert {name: one['margin_ns']['min'] / MS for name, one in result[
+            'requirements'].items()} == {'p reaction': 7, 'p age': -1}
+        assert not done.stderr
+    assert 'p reaction' in page.read_text()
+    status, out, _ = call('slack', graph)
+    table = out[out.index('How much less than required'):].splitlines()
+    assert status == 0
+    assert [line.split()[:4] for line in table[2:4]] == [
+        ['p', 'age', '2', 'ms'], ['p', 'reaction', '20', 'ms']]
+    graph.write_text(graph.read_text().replace('age: 2ms', 'age: 3ms'))
+    assert call('slack', graph, '--fail-under', 1).returncode == 0
+
+
 def test_a_run_that_misses_says_how_much_shorter_callbacks_must_be(tmp_path, call):
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HAND.replace('deadline: 8ms', 'deadline: 2ms'))
