@@ -211,7 +211,22 @@ class _Links:
                 if callback.kind == 'subscription' or callback.driven_by:
                     remedy += ", or add 'period:' if it comes from outside of the graph"
                 raise error(callback.kind, f'no callback publishes {quoted(topic)}',
-                            did_you_mean(topic, self.publishers, remedy), item=topic)
+                            self._similar_topic(callback, topic, remedy), item=topic)
+
+    def _similar_topic(self, callback: Callback, topic: str, otherwise: str) -> str:
+        """Return the remedy for a topic that is not published: where a similar one is."""
+        remedy = did_you_mean(topic, self.publishers, otherwise)
+        similar = next((each for each in self.publishers
+                        if remedy == f'did you mean {quoted(each)}?'), None)
+        if similar is None:
+            return remedy
+        publisher = self.callbacks[self.publishers[similar][0]]
+        entry = self.entries[publisher.key]
+        line = entry.line_of(
+            'may_publish' if similar in publisher.may_publish else 'publishes', similar)
+        place = f'line {line}' if entry.file == self.entries[callback.key].file else (
+            f'{entry.file}:{line}')
+        return f'did you mean {quoted(similar)} of {quoted(publisher.key)} ({place})?'
 
     def check_end(self, callback: Callback, without: list[str] | None) -> None:
         """Check that exactly the sinks have deadlines (rule 6); or collect those without."""
@@ -249,7 +264,7 @@ class _Links:
             writers = tuple(self.callbacks[place].key for place in self.publishers.get(read, ()))
             if not writers and read in callback.reads:
                 raise error('reads', f'it reads {quoted(read)}, which no callback publishes',
-                            did_you_mean(read, self.publishers, "add it to a 'publishes:'"),
+                            self._similar_topic(callback, read, "add it to a 'publishes:'"),
                             item=read)
             return QueueEdge(callback.key, read, writers)
         writer = f'{callback.node}:{read}'

@@ -152,3 +152,18 @@ def bound(task_set: TaskSet, path: Path, what: str) -> int | None:
             return None
         found += time
     return found
+
+
+def why_unbounded(task_set: TaskSet, path: Path, what: str) -> str | None:
+    """Return why ``bound`` is None; None: it is not."""
+    parts = segments(task_set, path)
+    for number, time in enumerate(times_of(parts, what)):
+        if time is None:
+            part = parts[number // 2]
+            if number % 2:
+                last = part.callbacks[-1]
+                is_sink = all(not vertex.successors for vertex in task_set.vertices
+                              if vertex.callback.key == last)
+                return f"'{last}' {'has' if is_sink else 'leads to'} no deadline"
+            return f"nothing says when '{part.callbacks[0]}' runs next"
+    return None

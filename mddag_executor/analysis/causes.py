@@ -72,8 +72,9 @@ REMEDIES = {
     'demoted': 'less work, or a longer deadline: it could no longer be in time, so others went '
                'first',
     'less important': 'less work of higher importance, or a higher importance of this sink',
-    'dropped': 'shorter callbacks before it, or a longer queue (QoS depth, or without '
-               '`keep: newest`)',
+    'dropped': 'shorter callbacks before it; for messages a longer queue (QoS depth, or without '
+               '`keep: newest`); a late release of a timer is dropped when its next one is '
+               'ready: less load, or a longer deadline',
     'destroyed': 'keep the node and its subscription until the job has ended',
     'not published': 'publish in each execution of the callback before it',
     'lost': 'reliable QoS or a longer queue (QoS depth); if a process ended early (see the '

@@ -50,14 +50,15 @@ def main(args: argparse.Namespace) -> int:
         load_with_or_without_deadlines,
         with_deadlines,
     )
-    from msg_graph.segments import bound
+    from msg_graph.segments import bound, why_unbounded
     name, text = common.read_text(args.graph)
     task_set = load_with_or_without_deadlines(text, name, None if args.graph == '-' else name)
     deadlines, measured = _assign(args, task_set)
     common.write_text(args.output, deadlines_in_text(task_set, deadlines))
     after = with_deadlines(task_set, deadlines)
     required: dict[str, dict[str, Bound]] = {
-        path.name: {what: {'required_ns': time, 'bound_ns': bound(after, path, what)}
+        path.name: {what: {'required_ns': time, 'bound_ns': bound(after, path, what),
+                           'why_unbounded': why_unbounded(after, path, what)}
                     for what, time in path.requirements.items()}
         for path in after.paths if path.requirements}
     more: AssignResultRare = {'requirements': required} if required else {}

@@ -80,7 +80,7 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> CheckResult:
     """
     from mddag_executor.core import Tables
     from mddag_executor.laboratory.necessary import necessary_tests
-    from msg_graph.segments import bound
+    from msg_graph.segments import bound, why_unbounded
     tables = Tables.build(task_set)
     dags: dict[str, CheckedDag] = {}
     for dag in task_set.dags:
@@ -90,7 +90,8 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> CheckResult:
     loads = [dag['load'] for dag in dags.values() if dag['load'] is not None]
     load = sum(loads) if len(loads) == len(dags) else None
     required: dict[str, dict[str, Bound]] = {
-        path.name: {what: {'required_ns': time, 'bound_ns': bound(task_set, path, what)}
+        path.name: {what: {'required_ns': time, 'bound_ns': bound(task_set, path, what),
+                           'why_unbounded': why_unbounded(task_set, path, what)}
                     for what, time in path.requirements.items()}
         for path in task_set.paths if path.requirements}
     more: CheckResultRare = {'requirements': required} if required else {}

@@ -77,7 +77,8 @@ def bounds_table(required: Mapping[str, Any]) -> str:
     """Return a table of requirements, and how long each takes at most if sinks are in time."""
     return table(('path', '', 'required', 'if all sinks are in time'), ([
         name, what, format_ns(each['required_ns']),
-        'not bounded' if each['bound_ns'] is None else format_ns(each['bound_ns'])]
+        f'not bounded: {each["why_unbounded"]}' if each['bound_ns'] is None else format_ns(
+            each['bound_ns'])]
         for name, every in required.items() for what, each in every.items()), grouped=1)
 
 

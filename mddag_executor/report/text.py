@@ -16,7 +16,10 @@ from mddag_executor.text import listed as listed_plainly
 Cell = str | int | None
 
 WIDTH, NARROW = 120, 100
-"""A table is at most 120 columns wide, or 100 with few rows, if its names can be shortened."""
+"""
+A table on a terminal is at most 120 columns wide, or 100 with few rows, if its names can be
+shortened.
+"""
 _FEW_ROWS = 15
 _LONGEST_LIST = 10
 _SHORTEST_NAME = 18
@@ -88,8 +91,8 @@ def table(
     """
     Return an aligned table; columns of numbers, with or without a unit, are right-aligned.
 
-    Long names are shortened in their middle, so that the table is at most ``WIDTH`` columns wide,
-    with few rows ``NARROW``.
+    Long names are shortened in their middle, so that a table on a terminal is at most ``WIDTH``
+    columns wide, with few rows ``NARROW``.  In a file or pipe names are whole: programs read them.
 
     :param header: the titles of the columns
     :param rows: their cells; None is printed as `-`
@@ -110,8 +113,9 @@ def table(
     lines = [[printable(title) for title in header], *body]
     names = [i for i, column in enumerate(columns)
              if not right[i] and not any(' ' in cell for cell in column)]
-    widths = _fitting([max(len(line[i]) for line in lines) for i in range(len(header))], names,
-                      most or (NARROW if len(body) <= _FEW_ROWS else WIDTH))
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    if most or sys.stdout.isatty():
+        widths = _fitting(widths, names, most or (NARROW if len(body) <= _FEW_ROWS else WIDTH))
     lines = [[shortened(cell, width) for cell, width in zip(line, widths)] for line in lines]
     texts = ['  '.join(
         cell.rjust(width) if is_right else cell.ljust(width)

@@ -64,6 +64,8 @@ class Bound(TypedDict):
     """The required reaction time or data age."""
     bound_ns: int | None
     """The longest one if all sinks are in time; null: nothing bounds it."""
+    why_unbounded: str | None
+    """The reason, if nothing bounds it."""
 
 
 class CheckResultRare(TypedDict, total=False):

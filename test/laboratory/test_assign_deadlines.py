@@ -11,7 +11,7 @@ from mddag_executor.laboratory.assign_deadlines import assigned
 from mddag_executor.laboratory.tasks import tasks_of
 from msg_graph import load, loads
 from msg_graph.edit import with_deadlines
-from msg_graph.segments import bound, segments
+from msg_graph.segments import bound, segments, why_unbounded
 import pytest
 
 from ..analysis.path_systems import random_system, simulated_run
@@ -81,6 +81,22 @@ def test_what_cannot_be_met_says_what_is_too_long(change, required, says):
     with pytest.raises(UsageError) as caught:
         assigned(loads(text + PATH.format(required)), 'max')
     assert says in str(caught.value)
+
+
+@pytest.mark.parametrize(('change', 'why'), [
+    (None, None),
+    (('reads: [x], deadline: 10ms', 'reads: [x], deadline: none'), "'/n:z' has no deadline"),
+    (('deadline: 5ms, execution_time: 1ms}', 'publishes: [/c], execution_time: 1ms}\n'
+      '      - {name: w, subscription: /c, deadline: none, execution_time: 1ms}'),
+     "'/n:x' leads to no deadline"),
+    (('timer: 10ms, reads: [x],', 'subscription: /d, sporadic: true, period: 1ms, reads: [x],'),
+     "nothing says when '/n:z' runs next")])
+def test_why_nothing_bounds_a_requirement(change, why):
+    text = GRAPH.replace(*change) if change else GRAPH
+    task_set = loads(text + PATH.format('reaction: 500ms'))
+    path, = task_set.paths
+    assert why_unbounded(task_set, path, 'reaction') == why
+    assert (bound(task_set, path, 'reaction') is None) == (why is not None)
 
 
 def holds(task_set):
