@@ -84,7 +84,8 @@ class Counts(NamedTuple):
     @property
     def missed(self) -> int:
         """Return the number of results that were not in time."""
-        return self.due - self.in_time
+        # an overdue result that turned out to be in time makes a difference negative
+        return max(0, self.due - self.in_time)
 
     def minus(self, earlier: Counts) -> Counts:
         """Return the difference to earlier counts."""

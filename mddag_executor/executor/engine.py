@@ -864,12 +864,6 @@ class Engine:
         for each in completes:
             if each.vertex in self._optional_edges:
                 published[each] = self._withhold(work, each, failed, end)
-        if self.verdicts.tally.overdue:
-            for each in completes:
-                deadline = self.verdicts.tally.overdue.get((each.vertex, each.job), -1)
-                if end <= deadline:  # it was reported overdue before this was known
-                    entity.busy_ns += deadline + 1 - end
-                    end = deadline + 1
         whole = (self.scheduler.fail if failed else self._complete)(x, end)
         if entity.awaiting is not None:
             whole = bool(completes)

@@ -139,6 +139,33 @@ def test_which_releases_of_a_timer_give_way_to_newer_ones(keys, release, dropped
     assert (timer.dropped, timer.skipped) == (dropped, 0 if dropped else 2)
 
 
+@pytest.mark.parametrize('reported_at', [41, 45])
+def test_a_sink_that_ended_in_time_is_in_time_also_if_it_was_reported_overdue(reported_at):
+    """Its thread could report the end only after the deadline."""
+    task_set = loads(graph(motor='name: drive, timer: 100ms, deadline: 40ms, tolerate: 1 of 3'))
+    events, misses = [], []
+    engine = new_engine(
+        task_set, record=lambda *event: events.append(event), on_miss=misses.append)
+    timer = entity_of(engine, task_set, 0, 0)
+    engine.timer_due(Work(timer, print), 0, 0)
+    work = engine.step(0, 30 * MS).work
+    engine.judge_overdue(40 * MS + 1)
+    engine.validate()
+    sink = engine.verdicts.tally.result()['dags']['/motor']['sinks']['/motor:drive']
+    assert (sink['late'], sink['overdue'], sink['tolerate']['worst']) == (1, 1, 1)
+    engine.finished(work, 30 * MS, 40 * MS, reported_at * MS, 0, 0)
+    engine.validate()
+    result = engine.verdicts.tally.result()
+    sink = result['dags']['/motor']['sinks']['/motor:drive']
+    assert [miss.kind for miss in misses] == ['overdue']
+    assert (sink['completed'], sink['late'], sink['overdue'], sink['tolerate']['worst']) == (
+        1, 0, 0, 0)
+    assert result['first_miss'] is None and not result['deadline_missed']
+    execution, = (event for event in events if event[0] == 'execution')
+    assert 40 * MS in execution and 40 * MS + 1 not in execution
+    assert not [event for event in events if event[0] == 'deadline']
+
+
 class OneUser:
     """An engine for a timer that starts jobs, and one subscription, of deadline 300 ms."""
 
