@@ -219,6 +219,17 @@ def test_a_run_without_anything_has_a_report_too():
     assert '</html>' in written(data)
 
 
+@pytest.mark.parametrize('others', [(), ('move, timer: 2ms, deadline: 2ms',)])
+def test_dags_without_a_deadline_have_a_report(others):
+    declared = ('update, timer: 1ms, publishes: [/map]',
+                'keep, subscription: /map, deadline: none', *others)
+    callbacks = ', '.join(f'{{execution_time: 10us, name: {each}}}' for each in declared)
+    task_set = msg_graph.loads(
+        f'{{mddag: 1, nodes: [{{node: /n, callbacks: [{callbacks}]}}]}}', 'g.yaml')
+    data = html.of_run(task_set, *runs.simulated(task_set, ms=5, workers=1))
+    assert len(drawn(data)['lines']) >= len(declared)
+
+
 @pytest.fixture
 def result(tmp_path):
     return replay(runs.by_hand(tmp_path / 'run.mcap')).result()
