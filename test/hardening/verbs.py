@@ -21,5 +21,7 @@ def run(*words, about=''):
     for line in (printed + said).split('\n'):
         assert line == printable(line), f'{about}: {words}'
     assert all(line.startswith(('error: ', 'warning: ')) for line in said.splitlines()), said
-    assert status != 2 or (printed == '' and 'error: ' in said), said
+    # A recording in which nothing was due has tables all the same.
+    assert status != 2 or 'error: ' in said and (
+        not printed or 'so no deadline was judged' in said), said
     return status, printed
