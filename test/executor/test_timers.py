@@ -378,7 +378,7 @@ def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_n
     """Not the one that rclpy makes for simulated time."""
     node = make_node('node', parameter_overrides=[Parameter('use_sim_time', value=True)])
     got = []
-    node.create_subscription(ClockMessage, '/clock', got.append, 10)
+    own = node.create_subscription(ClockMessage, '/clock', got.append, 10)
     publisher = make_node('clock').create_publisher(ClockMessage, '/clock', 10)
     executor = make_executor(loads(graph(
         node='name: on_clock, subscription: /clock, period: 1s, deadline: 1s')), nodes=[node])
@@ -386,4 +386,5 @@ def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_n
         matched(publisher, count=2)
         publisher.publish(ClockMessage(clock=TimeMessage(sec=7)))
         assert wait_for(lambda: got and node.get_clock().now().nanoseconds == 7_000 * MS)
+        assert executor._registry.by_id[id(own)].name == '/node:on_clock'
         assert wait_for(lambda: executor.statistics()['callbacks']['/node:on_clock']['ran'] == 1)
