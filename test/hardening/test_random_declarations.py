@@ -22,7 +22,7 @@ from ..msg_graph.brute import as_yaml
 from ..msg_graph.random_declarations import declarations
 from .verbs import run
 
-EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '60'))
+EXAMPLES = int(os.environ.get('HARDENING_EXAMPLES', '30'))
 TIMES = st.sampled_from(
     ['1us', '7us', '1ms', '10ms', '33.3ms', '999.999ms', '1s', '86400s', '1440min', '0.5ms'])
 TIME = st.sampled_from(['1us', '3us', '1ms', {'quantiles_us': [1, 2, 3]}])
