@@ -19,6 +19,7 @@ import os
 import random
 from typing import Any
 
+from mddag_executor.recording.columns import Ints
 from mddag_executor.simulate.workload import check_execution_times
 from mddag_executor.sources.bag_run import read_bag
 from mddag_executor.whatif.reschedule import Reschedule, reschedule
@@ -44,15 +45,15 @@ def reschedule_bag(
     counts = np.bincount(run.releases['dag'], minlength=len(task_set.dags)).tolist()
     generator = random.Random(seed)
     return reschedule(run, times=[
-        np.array([_drawn(dag, generator) for _ in range(count)], dtype=np.int64)
-        if times is None else np.tile(np.array(times[dag.index], dtype=np.int64), (count, 1))
+        _drawn(dag, count, generator) if times is None
+        else np.tile(np.array(times[dag.index], dtype=np.int64), (count, 1))
         for dag, count in zip(task_set.dags, counts)], overheads=False, **options)
 
 
-def _drawn(dag: Dag, generator: random.Random) -> Sequence[int]:
-    row = []
-    for vertex in dag.vertices:
-        declared = vertex.callback.execution_time
-        assert declared is not None     # checked before
-        row.append(declared.draw(generator.random()))
-    return row
+def _drawn(dag: Dag, count: int, generator: random.Random) -> Ints:
+    """Return execution times drawn for each vertex of a number of jobs."""
+    declared = [vertex.callback.execution_time for vertex in dag.vertices]
+    return np.fromiter(
+        (each.draw(generator.random()) for _ in range(count) for each in declared
+         if each is not None),      # checked before
+        dtype=np.int64, count=count * len(declared)).reshape(count, len(declared))

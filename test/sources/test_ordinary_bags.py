@@ -4,10 +4,12 @@
 
 from contextlib import closing
 import os
+import random
 import re
 import shutil
 import sqlite3
 import struct
+import tracemalloc
 
 from mcap.writer import Writer as McapWriter
 from mddag_executor import open_recording, replay, ReplayError, reschedule
@@ -17,7 +19,7 @@ from mddag_executor.sources.bag_run import read_bag
 from mddag_executor.sources.bags import Bag, UNKNOWN
 from mddag_executor.sources.kinds import BagError, is_ordinary
 from mddag_executor.trace import blocks, times, TraceError, TraceFile
-from mddag_executor.whatif.bags_reschedule import reschedule_bag
+from mddag_executor.whatif.bags_reschedule import _drawn, reschedule_bag
 from msg_graph import loads
 import numpy as np
 import pytest
@@ -394,3 +396,29 @@ def test_views_are_not_read(tmp_path):
                         'SELECT id + 1 FROM n) SELECT id, 1 topic_id, id timestamp, 0 data FROM n')
     with pytest.raises(BagError, match='it has views'):
         Bag(path, ())
+
+
+GRAPH_OF_DRAWN = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: a, subscription: /in, period: 10ms, publishes: [/out], execution_time: 1us}
+      - name: b
+        subscription: /out
+        deadline: 5ms
+        execution_time: {quantiles_us: [1, 2, 3]}
+"""
+
+
+def test_drawn_execution_times_take_no_more_memory_than_their_table():
+    dag, = loads(GRAPH_OF_DRAWN, 'g.yaml').dags
+    tracemalloc.start()
+    try:
+        drawn = _drawn(dag, 20_000, random.Random(1))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert drawn.shape == (20_000, 2) and drawn[:, 0].tolist() == [1000] * 20_000
+    assert 1000 < np.median(drawn[:, 1]) < 3000
+    assert peak < 1.5 * drawn.nbytes
