@@ -149,12 +149,21 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
         return _rescheduled_bag(args, source, settings)
     options.reject_options(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
+    from mddag_executor.sources.open import open_recording
+    from mddag_executor.whatif.agreement import disagreement
     from mddag_executor.whatif.reschedule import reschedule
+    processes, skip, name = _processes(args), args.begin or 0, source.name
     with Progress('replaying') as line:
-        return reschedule(
-            source.path, source.task_set, overheads=args.overheads is None,
-            dispatch_overhead=args.overheads or 0,
-            progress=line.events, processes=_processes(args), **settings)
+        recording = open_recording(source.path, source.task_set, name, line.events)
+        outcome = reschedule(
+            recording, overheads=args.overheads is None, dispatch_overhead=args.overheads or 0,
+            processes=processes, **settings)
+        is_changed = args.overheads is not None or processes is not None or any(
+            value is not None for key, value in settings.items() if key not in ('skip', 'name'))
+        text = disagreement(reschedule(recording, skip=skip) if is_changed else outcome)
+    if text is not None:
+        outcome.warnings.append(text)
+    return outcome
 
 
 def _rescheduled_bag(

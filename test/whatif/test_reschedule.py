@@ -2,13 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rescheduled: the recorded load through the core, with the same and with other settings."""
 
+from types import SimpleNamespace
+
 from mddag_executor import Replay, replay, ReplayError, reschedule
 from mddag_executor.core import NEVER, PolicyError
 from mddag_executor.errors import UsageError
+from mddag_executor.recording.columns import rows
+from mddag_executor.recording.tables import EXECUTIONS
 from mddag_executor.simulate import PREEMPT, Settings, simulate, START
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.load import Load
 from mddag_executor.trace.schema import GOES_ON
+from mddag_executor.whatif import agreement
+from mddag_executor.whatif.agreement import disagreement
 from mddag_executor.whatif.run_writer import write_trace
 from msg_graph import loads, Process
 import pytest
@@ -402,3 +408,46 @@ def test_overheads_are_measured_and_reproduced(tmp_path, delay, wake, early):
     for more, longest in (({}, 15), ({'dispatch_overhead': MS}, 18)):
         ideal = reschedule(path, overheads=False, **more).result()['dags']['a']['sinks']['/n:c']
         assert ideal['response_ns']['max'] == longest * MS
+
+
+def verdicts(in_time, late):
+    """Return the part of a replay or schedule that has its verdicts."""
+    dags = {'d': {'sinks': {'/n:t': {
+        'completed': in_time + late, 'late': late, 'overdue': 0, 'expired': 0}}}}
+    return SimpleNamespace(result=lambda: {'dags': dags})
+
+
+@pytest.mark.parametrize(('predicted', 'recorded', 'text'), [
+    ((96, 4), (92, 8), None),
+    ((9, 0), (0, 9), None),     # too few
+    ((80, 20), (40, 60), '80.0 % of the results in time, and 40.0 % were: predictions from it are '
+     'that far off or more, for other pools as well: other load of the machine and waits for '
+     "Python's lock are not part of them (callbacks that compute ran on a CPU for 25 % of their "
+     'time)'),
+    ((40, 60), (80, 20), '40.0 % of the results in time, and 80.0 % were: predictions from it are '
+     'that far off or more, for other pools as well')])
+def test_a_prediction_is_compared_with_what_the_recorded_pool_did(predicted, recorded, text):
+    executions = rows(EXECUTIONS, 3, holds_gil=(True, True, False), cpu=(10, 15, 1),
+                      busy=(50, 50, 900))
+    found = disagreement(SimpleNamespace(tally=verdicts(*predicted), recorded=SimpleNamespace(
+        tally=verdicts(*recorded), recording=SimpleNamespace(
+            run=SimpleNamespace(name='run.mcap'), executions=executions))))
+    assert found == (None if text is None else
+                     f'run.mcap: with the recorded pool the prediction has {text}')
+
+
+def test_a_contradicted_prediction_is_warned_of_with_any_pool(tmp_path, call, monkeypatch):
+    path = tmp_path / 'run.mcap'
+    trace = Written(path, """\
+mddag: 1
+nodes: [{node: /n, callbacks: [{name: t, timer: 100ms, deadline: 90ms}]}]
+""", workers=1)
+    for job in range(60):
+        trace.release(0, job, job * 100)
+        trace.run(0, 0, job, job * 100, job * 100 + 8, computed=(4 * MS, True))
+    trace.end(6000)
+    for points, options in ((5, ()), (-1, ()), (-1, ('--workers', '2'))):
+        monkeypatch.setattr(agreement, 'POINTS', points)
+        done = call('replay', path, '--reschedule', *options)
+        assert done.returncode == 0
+        assert ('with the recorded pool' in done.stderr) == (points < 0)
