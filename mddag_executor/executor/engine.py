@@ -36,7 +36,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from threading import get_native_id
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
@@ -75,9 +74,8 @@ from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.interpreter import has_waiting, Interpreter
 from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.path_watch import PathWatch
+from mddag_executor.executor.run_records import RunRecords
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
-from mddag_executor.trace.groups import EXECUTION, PUBLICATION
-from mddag_executor.trace.schema import GOES_ON
 from msg_graph import TaskSet
 from msg_graph.model import optional_edges
 
@@ -166,6 +164,8 @@ class Engine:
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.n_workers = n_workers
         self.record = record
+        self._records = None if record is None else RunRecords(
+            record, self.tables, self.scheduler.state)
         self.on_late = on_late
         self.undeclared = 0
         # entities whose executions a callback group has refused
@@ -201,23 +201,17 @@ class Engine:
     def taken(
         self, entity: Entity, message: Any, source_timestamp: int, number: int | None, now: int
     ) -> None:
-        """
-        Record that a message was taken at ``now``, which is not after it became ready.
-
-        :param number: its number among the messages of its publisher, if known.
-        """
-        assert self.record is not None
-        self.record(
-            'rmw_take', now, get_native_id(), id(entity.rclpy_object), id(message),
-            source_timestamp, True, number or 0)
+        """Record that a message was taken, while ``record`` is set (``RunRecords.take``)."""
+        assert self._records is not None
+        self._records.take(entity, message, source_timestamp, number, now)
 
     def never_taken(self, entity: Entity, count: int, now: int) -> None:
         """Note that the middleware dropped messages (see ``gaps``), as the next one shows."""
         if entity.is_own:
             return
         entity.lost += count
-        if self.record is not None:
-            self.record('messages_lost', now, get_native_id(), entity.address, count)
+        if self._records is not None:
+            self._records.lost(entity, count, now)
 
     def timer_due(self, work: Work, due: int, now: int) -> None:
         """Handle a timer that became due at ``due``."""
@@ -825,8 +819,8 @@ class Engine:
         if work is self._bypassing:
             self._bypassing = None
             entity.failed += failed
-            if self.record is not None:
-                self._record_run(work, start, end, vtid, worker)
+            if self._records is not None:
+                self._records.run(work, start, end, vtid, worker)
             return
         if self._holders:
             self._let_go(work)
@@ -851,7 +845,7 @@ class Engine:
         """End an execution that failed, may answer, or is recorded or watched; see there."""
         entity = work.entity
         x, work.x = work.x, -1
-        origin, record = work.origin, self.record
+        origin, records = work.origin, self._records
         entity.failed += failed
         completes = [] if origin is None else [origin]
         is_guess = False
@@ -882,17 +876,14 @@ class Engine:
             if entity.may_answer:
                 leg = GUESSED if is_guess else ANSWERED
                 entity.guessed += is_guess
-            if record is not None:
-                if failed:  # first, or its completion would count
-                    record('fail', now, vtid, dag, tables.index_in_dag[vertex], job)
-                record(
-                    EXECUTION, start, vtid, entity.address, dag, tables.index_in_dag[vertex], job,
-                    worker, work.ready_ns, state.job_release[slot] + tables.rad_offset[vertex],
-                    end, now, whole, leg, work.cpu_ns, state.x_holds[x])
+            if records is not None:
+                records.execution(
+                    work, origin, x, leg, start, end, now, vtid, worker, whole=whole,
+                    failed=failed)
             if whole:  # other messages of a sync take less
                 note_time(tables, state, vertex, entity.habit.needs_ns, entity.habit.holds, now)
-        elif record is not None:
-            self._record_run(work, start, end, vtid, worker)
+        elif records is not None:
+            records.run(work, start, end, vtid, worker)
         if self.path_watch is not None:
             self.path_watch.left(work)
 
@@ -936,8 +927,8 @@ class Engine:
         """Take a running execution off its worker until ``resume``."""
         self._core()
         work.entity.busy_ns += end - start
-        if self.record is not None:
-            self._record_run(work, start, end, vtid, worker, goes_on=True)
+        if self._records is not None:
+            self._records.run(work, start, end, vtid, worker, goes_on=True)
         if self.path_watch is not None:
             _, _, job, vertex = work.origin or work.answers or NO_ORIGIN
             self.path_watch.paused(work, vertex, job, start, end, work.sent)
@@ -970,8 +961,8 @@ class Engine:
         """Free the worker of an execution that could not finish because its context has ended."""
         if ran:
             work.entity.busy_ns += end - start
-            if self.record is not None:
-                self._record_run(work, start, end, vtid, worker)
+            if self._records is not None:
+                self._records.run(work, start, end, vtid, worker)
         self.lend(work)
         if self.path_watch is not None:
             self.path_watch.left(work)
@@ -994,44 +985,12 @@ class Engine:
         self._decided(now)
         self.ask_again()
 
-    def _record_run(
-        self, work: Work, start: int, end: int, vtid: int, worker: int, goes_on: bool = False
-    ) -> None:
-        """Record the run of an undeclared callback, or of one that goes on later."""
-        self._record_dispatch(work, start, vtid, worker, goes_on)
-        assert self.record is not None
-        self.record('callback_start', start, vtid, work.entity.address, False)
-        self.record('callback_end', end, vtid, work.entity.address)
-
-    def _record_dispatch(
-        self, work: Work, time: int, vtid: int, worker: int, goes_on: bool = False
-    ) -> None:
-        assert self.record is not None
-        _, dag, job, vertex = work.origin or NO_ORIGIN
-        if goes_on and dag < 0:     # only this says which pieces are one execution
-            job = GOES_ON
-        index, deadline = -1, 0
-        if dag >= 0:
-            index = self.tables.index_in_dag[vertex]
-            deadline = self.release_of(work) + self.tables.rad_offset[vertex]
-        self.record(
-            'dispatch', time, vtid, work.entity.address, dag, index, job, worker, work.ready_ns,
-            deadline, work.due_ns)
-
-    def _record_waiting(self, now: int) -> None:
-        """Record what waits at the end as dispatched then: a reader sees that it was not lost."""
-        for x, work in self._work.items():
-            if (self._state.x_state[x] in (WAITING, ALONE) and self._state.x_started[x] < 0
-                    and work.origin is not None):
-                self._record_dispatch(work, now, get_native_id(), -1)
-
     def publishes(
         self, work: Work | None, topic: str, address: int, message: Any, now: int, vtid: int
     ) -> None:
         """Note that a callback publishes, while ``notes_publications``; without the lock."""
-        if self.record is not None:
-            self.record(
-                PUBLICATION, now, vtid, address, id(message), max(0, header_stamp(message)))
+        if self._records is not None:
+            self._records.publication(address, message, now, vtid)
         if work is not None and self.path_watch is not None and topic in self.path_watch.topics:
             work.sent += (topic, now),
 
@@ -1067,8 +1026,8 @@ class Engine:
         """Judge jobs released from now (or a time) on, or none for now."""
         release = NEVER if not judging else now if since is None else since
         judge_from(self._state, release)
-        if self.record is not None:
-            self.record('judge_from', now, get_native_id(), release)
+        if self._records is not None:
+            self._records.judge_from(release, now)
 
     def requirements(self, now: int) -> dict[str, Any]:
         """Return the results of the requirements of paths, see ``PathWatch.result``."""
@@ -1141,8 +1100,8 @@ class Engine:
         """
         end = now if end is None else end
         self._ended = end
-        if self.record is not None:
-            self._record_waiting(now)
+        if self._records is not None:
+            self._records.waiting(self._work.values(), now)
         self.scheduler.expire_idle(end)
         self._decided(now)
         self.scheduler.finish(end)

@@ -385,6 +385,46 @@ def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_mo
     assert [engine.step(worker, 1).work for worker in (0, 1)] == messages
 
 
+def test_a_step_says_what_other_threads_are_to_do():
+    engine = new_engine(workers=3)
+    first, second = new_entity(), new_entity()
+    for entity in (first, second):
+        engine.ready(Work(entity, print), 0)
+    step = engine.step(0, 0)
+    assert step.work.entity is first and step.more and step.n_idle == 2 and step.holder is None
+    step = engine.step(1, 0)
+    assert step.work.entity is second and not step.more and step.n_idle == 1
+    first.wall_ns = second.wall_ns = 1000
+    for entity in (first, second):
+        engine.ready(Work(entity, print), 0)
+    step = engine.step(2, 0, others_wait=False)     # its thread will be free in time
+    assert step.is_short and not step.more and step.n_idle == 0
+    assert step.patience_ns == 4 * MS < engine.look(0).patience_ns * 2
+    assert not engine.look(0).more and engine.look(0).work is None
+
+
+def test_a_step_says_what_is_overtaken_and_when_the_next_deadline_is():
+    task_set = loads(graph(n='name: tick, timer: 10ms, deadline: 10ms'))
+    engine = new_engine(task_set, 3)
+    engine.interpreter.pauses = True
+    urgent, long = entity_of(engine, task_set, 0, 0), new_entity()
+    for entity in (urgent, long):
+        entity.habit = GilHabit(True)
+    long.habit.mean_ns = 10 ** 9
+    engine.ready(Work(long, print), 0)
+    step = engine.step(0, 0)
+    held = step.work
+    assert step.holder is held and step.overtaken is None and step.deadline == NEVER
+    engine.timer_due(Work(urgent, print), MS, MS)
+    step = engine.step(1, MS)
+    work = step.work
+    assert work.entity is urgent and step.holder is work and step.overtaken is held
+    assert step.deadline == 11 * MS and engine.interpreter.overtaken == [held]
+    engine.finished(work, MS, 2 * MS, 2 * MS, 0, 1)
+    step = engine.step(1, 2 * MS)
+    assert step.work is None and step.holder is held and step.deadline == NEVER
+
+
 @examples(150)
 @given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
 def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
