@@ -30,7 +30,7 @@ from typing import NamedTuple
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
 from mddag_executor.recording.columns import Ints, Mask
-from mddag_executor.recording.joins import different, rows_by, sort_by
+from mddag_executor.recording.joins import rows_by, sort_by
 from mddag_executor.recording.mapping import declared_keys
 from mddag_executor.recording.names import Callback, KINDS
 from mddag_executor.recording.recording import Recording
@@ -57,6 +57,8 @@ IRREGULAR = 3
 """Times between executions are irregular if one in ten is so many times another one in ten."""
 ONCE_PERIODS = 3
 """A timer fires once if it was silent for so many periods after its only execution."""
+NEVER_PERIODS = 20
+"""A timer never fires if a recording of so many periods has no execution of it."""
 
 
 LEAST_COPIED = 5
@@ -103,6 +105,8 @@ class System:
         self._process_names = recording.names.processes
         self._names = recording.names
         self._end = recording.end
+        begin = recording.end if recording.start is None else recording.start
+        self._length = recording.end - begin
         self._entities = [entity for entity in sorted(
             self._names.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
         if not self._entities:
@@ -151,26 +155,42 @@ class System:
                     self._publishers[known.node.name][known.topic] = True
 
     def _find_headers(self, recording: Recording) -> None:
-        """Find the header stamps of messages, by node and topic, and by topic."""
-        self._sent_headers: dict[tuple[str, str], Ints] = {}
+        """Find the header stamps of messages: by topic, and of the executions of callbacks."""
+        #: By callback's number and topic.
+        self._sent_headers: dict[tuple[int, str], Ints] = {}
         self._headers: dict[str, list[Ints]] = {}
-        sent, publishers = recording.publications, self._names.publishers
-        numbers, which = different(sent['publisher'])
-        for number, mine in zip(numbers.tolist(), rows_by(which, len(numbers))):
-            publisher, stamps = publishers.get(number), sent['header_stamp'][mine]
-            stamps = np.unique(stamps[stamps > 0])
-            if publisher is not None and len(stamps):
+        sent = recording.publications
+        sent = sent[sent['header_stamp'] > 0]
+        by = np.where(sent['execution'] >= 0, np.append(
+            recording.executions['callback'], 0)[sent['execution']], 0)
+        pairs, which = np.unique(
+            np.stack((by, sent['publisher'])), axis=1, return_inverse=True)
+        for (callback, number), mine in zip(
+                pairs.T.tolist(), rows_by(which.reshape(-1), pairs.shape[1])):
+            publisher = self._names.publishers.get(number)
+            if publisher is not None:
+                stamps = np.unique(sent['header_stamp'][mine])
                 self._headers.setdefault(publisher.topic, []).append(stamps)
-                if publisher.node is not None:
-                    self._sent_headers[publisher.node.name, publisher.topic] = stamps
+                self._sent_headers[callback, publisher.topic] = stamps
 
-    def _copied_share(self, node: str, topic: str, received: str) -> float:
-        """Return how many of a topic's messages from a node have a stamp of a received topic."""
-        stamps = self._sent_headers.get((node, topic), _NO_STAMPS)
-        there = self._headers.get(received)
-        if there is None or len(stamps) < LEAST_COPIED:
-            return 0.0
-        return float(np.isin(stamps, np.concatenate(there)).mean())
+    def _copied_from(
+        self, node: str, topic: str, several: list[DraftCallback], total: int
+    ) -> DraftCallback | None:
+        """
+        Return the one of the subscriptions of a node whose header stamps its messages have.
+
+        None: there are no header stamps, or those of none or several of them; or the same stamp
+        is published again and again, as that of the latest value.
+        """
+        stamps = np.concatenate([_NO_STAMPS, *(
+            self._sent_headers.get((entity.number, topic), _NO_STAMPS)
+            for entity in self._entities
+            if entity.node_name == node and entity.kind == 'subscription')])
+        if len(stamps) < LEAST_COPIED or total > (1 + DRIVEN_SHARE) * len(stamps):
+            return None
+        found = [each for each in several if np.isin(stamps, np.concatenate(
+            self._headers.get(each.starts[0], [_NO_STAMPS]))).mean() >= COPIED_SHARE]
+        return found[0] if len(found) == 1 else None
 
     def draft(self) -> Draft:
         """Return the whole system."""
@@ -197,6 +217,10 @@ class System:
         leave_out_sources(draft, lambda callback: (
             callback.runs == 0 and callback.kind != 'timer' and callback.key not in declared),
             'it never ran')
+        leave_out_sources(draft, lambda callback: (
+            callback.runs == 0 and callback.kind == 'timer' and callback.key not in declared
+            and self._length > NEVER_PERIODS * (callback.period_ns or DAY)),
+            'it never fired, so it was cancelled, or reset each time before')
         draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
         return draft
 
@@ -212,20 +236,21 @@ class System:
                          if each.kind == 'subscription' and each.key not in declared]
         topics = dict.fromkeys(topic for each in subscriptions for topic in each.publishes)
         for topic in topics:
-            several = [each for each in subscriptions if topic in each.publishes
-                       and each.kind == 'subscription' and each.name in node.callbacks]
-            if len({each.starts[0] for each in several}) < 2:
-                continue
+            left = [each for each in subscriptions
+                    if each.kind == 'subscription' and each.name in node.callbacks]
+            several = [each for each in left if topic in each.publishes]
             total = sum(_published_by(each, topic) for each in several)
-            copied = [each for each in several if self._copied_share(
-                node.name, topic, each.starts[0]) >= COPIED_SHARE]
-            if len(copied) == 1:
-                driver, why = copied[0], (
-                    f'{topic} has the header stamps of {copied[0].starts[0]}')
+            driver = self._copied_from(node.name, topic, left, total)
+            if driver is not None and several != [driver]:
+                if driver not in several:
+                    several.append(driver)
+                why = f'{topic} has the header stamps of {driver.starts[0]}'
+            elif driver is not None or len({each.starts[0] for each in several}) < 2:
+                continue
             else:
                 driver = min(several, key=lambda each: abs((each.runs or 0) - total))
                 runs = [each.runs or 0 for each in several]
-                if copied or max(runs) - min(runs) <= DRIVEN_SHARE * max(runs) or abs(
+                if max(runs) - min(runs) <= DRIVEN_SHARE * max(runs) or abs(
                         (driver.runs or 0) - total) > max(LEAST_SILENT, DRIVEN_SHARE * total):
                     continue
                 why = (f'its executions published {topic} {total} times, and '

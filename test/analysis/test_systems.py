@@ -114,6 +114,7 @@ def test_names_periods_and_what_no_one_declares(tmp_path):
     r.node(300, '/a')       # nodes are sorted
     r.timer(310, 300, 50 * MS)
     ran(r, 1, 1, 1_000 * MS, MS, 110)
+    ran(r, 3, 1, 1_050 * MS, MS)         # else it would be left out
     ran(r, 211, 1, 1_100 * MS, MS)       # of /cam/ask/get_state: the others never run
     text = declaration_of(System(r.write()).draft())
     assert re.findall(r'name: (.*)', text) == [
