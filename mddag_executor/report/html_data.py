@@ -20,7 +20,7 @@ from mddag_executor.analysis.usage import PoolUse
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import counts, SinkTally, VERDICTS
 from mddag_executor.recording.columns import Ints, Table
-from mddag_executor.recording.joins import equal, rows_by
+from mddag_executor.recording.joins import rows_by
 from mddag_executor.report.columns import executions
 from mddag_executor.report.tables import missed_share, short_names
 from mddag_executor.report.text import format_ns, printable, shortened
@@ -175,12 +175,16 @@ def _verdicts_of(data: ReportData, table: Table) -> tuple[Ints, Ints]:
     found, least = np.full(len(table), -1), np.full(len(table), np.inf)
     of_dag = rows_by(table['dag'] + 1, len(data.replay.task_set.dags) + 1)[1:]
     of_sink = rows_by(verdicts['sink'], len(data.replay.task_set.vertices))
+    jobs = data.replay.recording.jobs
+    place, judged_place = jobs.places(table), jobs.places(verdicts)
     for dag, first, rows in zip(data.replay.task_set.dags, first_vertex, of_dag):
         for sink in dag.sinks:
             mine = rows[np.isin(table['vertex'][rows] - first, _ancestors(dag, sink))]
-            judged = of_sink[first + sink]
-            at = equal(verdicts['job'][judged], table['job'][mine])
-            mine, judged = mine[at >= 0], judged[at[at >= 0]]
+            judged_in = np.full(len(jobs) + 1, -1)      # by place of a job; the last is for none
+            judged_in[judged_place[of_sink[first + sink]]] = of_sink[first + sink]
+            judged_in[-1] = -1
+            judged = judged_in[place[mine]]
+            mine, judged = mine[judged >= 0], judged[judged >= 0]
             nearer = share[judged] < least[mine]
             found[mine[nearer]], least[mine[nearer]] = judged[nearer], share[judged[nearer]]
     return found, np.where(
