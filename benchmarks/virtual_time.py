@@ -33,7 +33,7 @@ from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment, judge_of
 from mddag_executor.laboratory.generate import generate, Options
-from mddag_executor.simulate.engine import END
+from mddag_executor.simulate import END
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.schedule import schedule, Settings
 from mddag_executor.simulate.workload import draw_execution_times, periodic_load

@@ -252,7 +252,7 @@ def ready_undeclared(
     return x
 
 
-def edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
+def satisfy_edge(t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int) -> None:
     """Make one trigger edge into ``vertex`` true for a job: its join countdown (rule 2)."""
     x = s.job_base[slot] + t.region_offset[vertex]
     s.x_pending[x] -= 1
@@ -592,7 +592,7 @@ def _complete_vertex(
             older = before
     if s.scalars[PROPAGATE] == 1:  # a sink, which may have ended the job, has no successors
         for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
-            edge(t, s, key, slot, t.successors[i], now)
+            satisfy_edge(t, s, key, slot, t.successors[i], now)
 
 
 def _complete_in(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:

@@ -190,7 +190,7 @@ def fill_state(
 
     :param propagate: 1: completions make the graph's edges true at once (simulation); 0: messages
         do, leg by leg, and the driver makes each leg ready (live); 2: messages do, and the driver
-        reports each with ``rules.edge`` (rescheduling, with message latency).
+        reports each with ``rules.satisfy_edge`` (rescheduling, with message latency).
     :param urgency: the kind of the policy's keys, ``DEADLINE_KEYS``, …
     """
     for _ in range(N_SCALARS):

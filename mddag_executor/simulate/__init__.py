@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation in virtual time: the core with given releases and execution times."""
 
-from mddag_executor.simulate.engine import END, LogEntry, PREEMPT, START
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.policies import ALL_POLICIES, policy
+from mddag_executor.simulate.pool import END, LogEntry, PREEMPT, START
 from mddag_executor.simulate.run import JUDGES, simulate, SimulatedRun
 from mddag_executor.simulate.schedule import schedule, Scheduled, Settings
 from mddag_executor.simulate.workload import (

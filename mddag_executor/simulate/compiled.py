@@ -11,10 +11,13 @@ Theory of operation
    modules.  No rule exists twice.  Only ``add_heap`` is replaced, because an empty list has no
    type.  The policy is an additional field of the tables; the key function selects by it, so one
    compilation is enough for all policies.
-2. numba stores the machine code of the entry points (``kernel``) on disk (``cache=True``).  It
-   only checks the file of the entry point itself, so a hash of all sources is part of the stored
-   name.  numba is imported, and code is compiled, on first use only.
-3. Named tuples are passed as structures, which have three words for each field: the words of a
+2. numba links each function into its callers, and optimises it there again.  So the large and the
+   rarely called functions (``PARTS``) are compiled once, as functions that others call as they
+   call those of C: they are known to the linker by a symbol.  The others are linked into these.
+3. numba stores the machine code of the parts and of the entry points (``kernel``) on disk
+   (``cache=True``).  It only checks the file of a function itself, so a hash of all sources is
+   part of the stored name.  numba is imported, and code is compiled, on first use only.
+4. Named tuples are passed as structures, which have three words for each field: the words of a
    vector (address, length, capacity; see ``vectors``), or an integer in the first word.
 """
 
@@ -24,14 +27,14 @@ import _thread
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import ctypes
-from functools import cache
+from functools import cache, partial
 import hashlib
 from importlib.util import find_spec
 import os
 from pathlib import Path
 import signal
 import threading
-from types import FrameType, FunctionType, ModuleType
+from types import FrameType, FunctionType
 from typing import Any
 
 from mddag_executor import progress
@@ -41,15 +44,15 @@ from mddag_executor.core.tables import Tables
 from mddag_executor.errors import UsageError
 from mddag_executor.simulate import deliveries, dispatch, engine, load, machine, polling, pool
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import LogEntry, Orders
+from mddag_executor.simulate.engine import Orders
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.policies import ALL_POLICIES
-from mddag_executor.simulate.pool import Pool
+from mddag_executor.simulate.pool import LogEntry, Pool
 import numpy as np
 import numpy.typing as npt
 
-_COMPILE_S = 35.0   # approximate compile time
+_COMPILE_S = 20.0   # approximate compile time
 _REPEATS = 4        # assumed repetitions of such work, as with other settings
 
 _MODULES = (
@@ -60,6 +63,19 @@ _NOT_COMPILED = frozenset({
     'empty', 'as_object', 'add_heap', 'rad_offsets', 'reached_sinks', 'mean_time',
     'policy', 'find', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
 ENTRY_POINTS = ('free_run', 'run_each')
+PARTS = (
+    # called for each execution
+    'complete', 'make_ready', 'take',
+    # called for each job, or for some executions
+    '_preempt', 'close_job', 'judge', 'release_job', 'release_load', 'unlink',
+    # called in an overload
+    '_keep_newest', '_keep_timely', 'admit', 'demote', 'drop', 'expire_idle', 'give_up',
+    'judge_incomplete', 'note_late',
+    # called once, or with several processes, messages that take time, GIL and CPUs
+    '_fill', '_take_of_several', 'add_slot', 'arrive_due', 'call_next', 'decide', 'ends_sending',
+    'fail', 'fill_state', 'finish', 'leave_outer', 'ready_undeclared', 'sends_at_start', 'settle',
+    'share', 'starts', 'take_polled', 'withhold')
+"""The functions that are compiled separately, and called as functions of C."""
 _REPLACED = ('add_heap', 'heapify', 'heappop', 'heappush')
 
 
@@ -71,7 +87,7 @@ def available() -> bool:
 @cache
 def entry_points() -> dict[str, Callable[..., Any]]:
     """Return the compiled entry points of ``kernel`` by name; they are compiled when called."""
-    from mddag_executor.simulate import kernel, vectors
+    from mddag_executor.simulate import kernel, parts, vectors
     from numba import njit
     space = dict(vars(kernel))  # with its name: code loaded from disk looks its module up
     for module in _MODULES:
@@ -79,50 +95,69 @@ def entry_points() -> dict[str, Callable[..., Any]]:
             if not name.startswith('__'):
                 assert space.setdefault(name, value) is value, f'there are two of {name}'
     space.update((name, getattr(vectors, name)) for name in _REPLACED)
-    for module in _MODULES:
-        inner = ModuleType(module.__name__)  # for names such as `rules.complete`
-        for name, function in _functions(module):
-            # only compiled functions call it: no wrappers for Python or C
-            space[name] = njit(
-                error_model='numpy', no_cpython_wrapper=True, no_cfunc_wrapper=True)(
-                    _bound(function, space))
-            setattr(inner, name, space[name])
-        if module in (jobs, overload, rules):
-            space[module.__name__.rsplit('.', 1)[1]] = inner
-    kernel.bind_policies(space)
     sources = _hash_of_sources()
+    for name, function in _functions().items():
+        bound = _bound(function, space)
+        if name in PARTS:
+            _parts[name] = parts.Part(bound, sources, str(kernel.__file__))
+            space[name] = _parts[name].callee
+        else:
+            space[name] = parts.linked(bound)
+    kernel.bind_policies(space)
     for name in ENTRY_POINTS:
-        space[name] = _cached(_bound(getattr(kernel, name), space), sources)
+        space[name] = _stored(njit, _bound(getattr(kernel, name), space))
     return {name: space[name] for name in ENTRY_POINTS}
 
 
-def _cached(function: FunctionType, sources: str) -> Any:
-    from numba import njit
+_parts: dict[str, Any] = {}
+
+
+@cache
+def _compile_parts() -> None:
+    """Compile the parts, or load them from disk; the entry points need them."""
+    from mddag_executor.simulate.parts import called_first
+    from numba import cfunc
+    is_new = not _is_compiled()
+    entry_points()
+    for number, name in enumerate(called_first(PARTS, _functions())):
+        if is_new:
+            progress.report(
+                f'compiling the core, once: part {number + 1} of {len(PARTS) + 1} '
+                f'(about {_COMPILE_S:.0f} s in all)')
+        _parts[name].compile(partial(_stored, cfunc))
+
+
+def _stored(compiler: Any, function: FunctionType, *signature: Any) -> Any:
+    """Compile a function with a compiler of numba, and store the code on disk if possible."""
     # part of the names of numba's files
-    function.__qualname__ = f'{function.__name__}_{sources}'
+    function.__qualname__ = f'{function.__name__}_{_hash_of_sources()}'
     try:
-        return njit(error_model='numpy', nogil=True, cache=True)(function)
+        return compiler(*signature, error_model='numpy', nogil=True, cache=True)(function)
     except RuntimeError:    # no writable folder
-        return njit(error_model='numpy', nogil=True)(function)
+        return compiler(*signature, error_model='numpy', nogil=True)(function)
 
 
-def _functions(module: ModuleType) -> list[tuple[str, FunctionType]]:
-    return [
-        (name, value) for name, value in vars(module).items()
+def _functions() -> dict[str, FunctionType]:
+    """Return all functions of the source by name."""
+    return {
+        name: value for module in _MODULES for name, value in vars(module).items()
         if isinstance(value, FunctionType) and value.__module__ == module.__name__
-        and name not in _NOT_COMPILED]
+        and name not in _NOT_COMPILED}
 
 
 def _bound(function: FunctionType, space: dict[str, Any]) -> FunctionType:
     """Return a function with the same code and another global namespace."""
-    return FunctionType(function.__code__, space, function.__name__, function.__defaults__)
+    bound = FunctionType(function.__code__, space, function.__name__, function.__defaults__)
+    bound.__annotations__ = function.__annotations__
+    return bound
 
 
+@cache
 def _hash_of_sources() -> str:
     folder = Path(__file__).parent
     paths = [Path(str(module.__file__)) for module in _MODULES]
     digest = hashlib.sha256()
-    for path in (*paths, folder / 'kernel.py', folder / 'vectors.py'):
+    for path in (*paths, *(folder / f'{name}.py' for name in ('kernel', 'parts', 'vectors'))):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -153,8 +188,6 @@ def _is_compiled() -> bool:
 
 def prepare() -> None:
     """Compile the core, or load it from disk, with a call that runs nothing."""
-    if not _is_compiled():
-        progress.report(f'compiling the core, once: about {_COMPILE_S:.0f} s')
     with _interruptible():
         run_each(Tables.build(None), Load([], [], [], [], [], []), 'rad',
                  Orders(*[0] * len(Orders._fields)))
@@ -198,16 +231,18 @@ def run_each(
     load = load._replace(cost_base=[*load.cost_base])   # is changed
     lent = [Memory(*tables, list(ALL_POLICIES).index(policy)), Memory(*load), Memory(*orders)]
     missed = Memory(np.zeros(runs))
-    core, _, _, _, busy, log = working = [
+    core, workers, *_ = working = [
         Memory(*[0] * len(fields)) for fields in (
-            State._fields, Pool._fields, Deliveries._fields, Machine._fields, ('busy',), ('log',))]
+            State._fields, Pool._fields, Deliveries._fields, Machine._fields)]
     addresses = [each.address for each in working]
+    _compile_parts()
     ended = entry_points()['run_each'](
         *(each.address for each in lent), *addresses, missed.address)
     try:
-        place = State._fields.index('decisions')
-        return ((int(ended), Rows(log.words(0, 6)),  # type: ignore[return-value]
-                 Rows(core.words(place, 6)), busy.words(0, 1)[:, 0].tolist()),
+        decisions, busy, log = (
+            State._fields.index('decisions'), *map(Pool._fields.index, ('busy', 'log')))
+        return ((int(ended), Rows(workers.words(log, 6)),  # type: ignore[return-value]
+                 Rows(core.words(decisions, 6)), workers.words(busy, 1)[:, 0].tolist()),
                 missed.words(0, 1)[:, 0].tolist())
     finally:
         entry_points()['free_run'](*addresses)

@@ -6,12 +6,12 @@ Messages in virtual time, if transport takes time or executions may fail.
 Theory of operation
 -------------------
 If transport takes time, an edge to a successor is satisfied ``delay`` after its vertex completes;
-the core gets each edge by ``rules.edge``.  With a negative delay the callback published before its
-end: the edge is satisfied that long before the end, but not before the start.  With preemption,
-edges are satisfied at the end.  A delay of NEVER means that nothing is published; over an edge
-that its publisher takes only sometimes, the vertex is then not due (rule 13).  If executions
-may be stopped (see ``machine``), the end is not known in advance, but the *place* is: the progress
-of the execution when it publishes.
+the engine reports each edge to the core (``rules.satisfy_edge``).  With a negative delay the
+callback published before its end: the edge is satisfied that long before the end, but not before
+the start.  With preemption, edges are satisfied at the end.  A delay of NEVER means that nothing
+is published; over an edge that its publisher takes only sometimes, the vertex is then not due
+(rule 13).  If executions may be stopped (see ``machine``), the end is not known in advance, but
+the *place* is: the progress of the execution when it publishes.
 
 A message is ignored if its job has ended.
 """
@@ -21,8 +21,9 @@ from __future__ import annotations
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-from mddag_executor.core import jobs, rules
+from mddag_executor.core.jobs import withhold
 from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.rules import complete, fail, satisfy_edge
 from mddag_executor.core.state import OPEN, QueueEntry, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.load import FAILS, Load, place_of
@@ -114,11 +115,11 @@ def ends_sending(
         while m.publishes_at[x] < NEVER:
             _publish_next(t, s, key, load, d, m, x, now)
     if len(load.fates) > 0 and load.fates[place_of(s, load, x)] == FAILS:
-        rules.fail(t, s, key, x, now)
+        fail(t, s, key, x, now)
     else:
         if s.job_state[slot] == OPEN:
             _withhold_unsent(t, s, load, x, now)
-        rules.complete(t, s, key, x, now)
+        complete(t, s, key, x, now)
     preemptive = d.scalars[MAY_PREEMPT] != 0
     for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
         delay = delay_of(t, s, load, x, edge)
@@ -133,7 +134,7 @@ def _withhold_unsent(t: Tables, s: State, load: Load, x: int, now: int) -> None:
     vertex = s.x_vertex[x]
     for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
         if t.is_optional[edge] != 0 and delay_of(t, s, load, x, edge) >= NEVER:
-            jobs.withhold(t, s, s.x_slot[x], t.successors[edge], now)
+            withhold(t, s, s.x_slot[x], t.successors[edge], now)
 
 
 def arrive_due(
@@ -172,4 +173,4 @@ def _arrive(
 ) -> None:
     if (s.job_state[slot] == OPEN and s.job_index[slot] == job
             and s.job_dag[slot] == t.dag_of[vertex]):
-        rules.edge(t, s, key, slot, vertex, now)
+        satisfy_edge(t, s, key, slot, vertex, now)

@@ -21,9 +21,9 @@ from __future__ import annotations
 
 from heapq import heapify
 
-from mddag_executor.core import rules
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import come_forward, defer, first_of, may_start, wait_alone
+from mddag_executor.core.rules import lend, let_group, peek, take
 from mddag_executor.core.state import N_IDLE, ORDER, State, WAITING
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate.polling import take_polled
@@ -48,9 +48,9 @@ def dispatch(t: Tables, s: State, p: Pool, key: KeyFunction, now: int) -> int:
     elif len(p.process) > 0:
         x = _take_of_several(t, s, p, now)
     elif s.scalars[N_IDLE] > 0:
-        x = rules.take(t, s, idle_worker(s, p, 1), now)
+        x = take(t, s, idle_worker(s, p, 1), now)
     else:
-        x = rules.peek(t, s, now)
+        x = peek(t, s, now)
         if x >= 0:
             x = _preempt(t, s, p, key, x, now) if p.scalars[PREEMPTIVE] != 0 else -1
     if x >= 0:
@@ -70,8 +70,8 @@ def _preempt(t: Tables, s: State, p: Pool, key: KeyFunction, x: int, now: int) -
     if largest <= key_of_first[0]:
         return -1
     victim = s.worker_x[worker]
-    rules.lend(s, victim)
-    x = rules.take(t, s, worker, now)
+    lend(s, victim)
+    x = take(t, s, worker, now)
     _put_back(t, s, p, key, victim, now)
     return x
 
@@ -89,17 +89,17 @@ def _put_back(t: Tables, s: State, p: Pool, key: KeyFunction, x: int, now: int) 
 def _take_of_several(t: Tables, s: State, p: Pool, now: int) -> int:
     """Dispatch what comes first among the executions of processes that have an idle worker."""
     _bring_forward(s, p)
-    x = rules.peek(t, s, now)
+    x = peek(t, s, now)
     worker = -1
     while x >= 0:
         worker = idle_worker(s, p, s.process[s.x_vertex[x]])
         if worker >= 0:
             break
         defer(s, s.ready, p.aside)
-        rules.let_group(s, x)
-        x = rules.peek(t, s, now)
+        let_group(s, x)
+        x = peek(t, s, now)
     if x >= 0:
-        x = rules.take(t, s, worker, now)
+        x = take(t, s, worker, now)
     for i in range(len(p.aside)):
         s.held_back.append(p.aside[i])
     p.aside.clear()

@@ -25,8 +25,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mddag_executor.core import jobs, overload, rules
+from mddag_executor.core.jobs import finish, give_up, is_miss, release_job
+from mddag_executor.core.overload import admit
 from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.rules import complete, make_ready, ready_undeclared
 from mddag_executor.core.state import (
     add_slot,
     EXPIRED,
@@ -55,13 +57,7 @@ from mddag_executor.simulate.machine import (
     share,
     starts,
 )
-from mddag_executor.simulate.pool import divide, fill_pool, Pool
-
-# Kinds of log entries.
-START, END, PREEMPT = range(3)
-
-LogEntry = tuple[int, int, int, int, int, int]
-"""(time, kind, worker, DAG, global vertex, job): one change of a worker."""
+from mddag_executor.simulate.pool import divide, END, fill_pool, Pool, PREEMPT, START
 
 
 class Orders(NamedTuple):
@@ -85,31 +81,28 @@ class Orders(NamedTuple):
 
 def run(
     t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Load,
-    o: Orders, busy: list[int], log: list[LogEntry], progress: Callable[[int], None] | None,
+    o: Orders, progress: Callable[[int], None] | None,
 ) -> int:
     """
     Run the core over a load, with an empty state, pool, …; return the end, ns.
 
-    Decisions are in ``s.decisions``.  With ``Orders.stop_at_first_miss`` the run ends with the
-    instant at which the first miss is known: a late completion, or an early end of a job.
+    Decisions are in ``s.decisions``, busy times and log in the pool.  With
+    ``Orders.stop_at_first_miss`` the run ends with the instant at which the first miss is known: a
+    late completion, or an early end of a job.
 
-    :param busy: receives by worker its busy time, ns; ``log``: the log of the workers, if wanted.
     :param progress: receives the virtual time at each event.
     """
     _fill(t, s, p, d, m, load, o)
     sends, stops = len(load.delay_base) > 0, is_used(m)
     n_workers, n_releases = len(s.worker_x), len(load.times)
-    finish_at, running, since = [NEVER] * n_workers, [-1] * n_workers, [-1] * n_workers
-    for _ in range(n_workers):
-        busy.append(0)
     now = next_release = 0
     while now < o.horizon:
         instant = NEVER
         if next_release < n_releases and load.times[next_release] < o.horizon:
             instant = load.times[next_release]
         for w in range(n_workers):
-            if finish_at[w] < instant:
-                instant = finish_at[w]
+            if p.finish_at[w] < instant:
+                instant = p.finish_at[w]
         if sends:
             instant = min(instant, next_arrival(d))
         if stops:
@@ -123,17 +116,17 @@ def run(
         if stops:
             settle(s, m, now)
         for w in range(n_workers):
-            if finish_at[w] == now:
-                finish_at[w] = NEVER
+            if p.finish_at[w] == now:
+                p.finish_at[w] = NEVER
                 x = s.worker_x[w]
-                busy[w] += now - since[w]
-                since[w] = running[w] = -1
+                p.busy[w] += now - p.since[w]
+                p.since[w] = p.running[w] = -1
                 if o.keep_log != 0:
-                    _note(t, s, log, now, END, w, x)
+                    _note(t, s, p, now, END, w, x)
                 if sends:
                     ends_sending(t, s, key, load, d, m, x, now)
                 else:
-                    rules.complete(t, s, key, x, now)
+                    complete(t, s, key, x, now)
         if now == o.horizon:
             break
         if sends:
@@ -141,16 +134,16 @@ def run(
         while next_release < n_releases and load.times[next_release] == now:
             release_load(t, s, key, load, next_release, now)
             next_release += 1
-        _dispatch(t, s, p, d, m, key, load, o, now, finish_at, running, since, busy, log)
+        _dispatch(t, s, p, d, m, key, load, o, now)
         if stops:
-            share(s, m, now, finish_at)
+            share(s, m, now, p.finish_at)
         if o.stop_at_first_miss != 0 and any_missed(s, seen):
             break
     for w in range(n_workers):
-        if since[w] >= 0:
-            busy[w] += now - since[w]
+        if p.since[w] >= 0:
+            p.busy[w] += now - p.since[w]
     if o.judge_open != 0 and now == o.horizon:
-        jobs.finish(t, s, now)
+        finish(t, s, now)
     return now
 
 
@@ -174,7 +167,7 @@ def _fill(
             place = load.cost_base[t.dag_of[v]] + t.region_offset[v]  # of its first job, if any
             if place < len(load.holds):
                 s.holder[v] = load.holds[place]
-    overload.admit(t, s)
+    admit(t, s)
 
 
 def release_load(
@@ -185,51 +178,50 @@ def release_load(
     job = load.jobs[i]
     cost = load.cost_base[dag] + job * load.cost_stride[dag]
     if dag == t.n_dags:
-        x = rules.ready_undeclared(
+        x = ready_undeclared(
             t, s, key, job, -1, load.holds[cost] if len(load.holds) > 0 else 0, -1, now)
         s.job_index[s.x_slot[x]] = job
         s.x_cost[x] = s.x_left[x] = load.costs[cost]
         return
     release = load.releases[i] if len(load.releases) > 0 else now
-    slot = jobs.release_job(t, s, dag, job, release, now)
+    slot = release_job(t, s, dag, job, release, now)
     if slot < 0:
         add_slot(t, s, dag)
-        slot = jobs.release_job(t, s, dag, job, release, now)
+        slot = release_job(t, s, dag, job, release, now)
     base = s.job_base[slot]
     source = t.region_offset[t.source[dag]]
     if len(load.fates) > 0:
         if load.fates[cost + source] == SKIPPED:
-            jobs.give_up(t, s, slot, EXPIRED, now)
+            give_up(t, s, slot, EXPIRED, now)
             return
     for place in range(t.n_region[dag]):
         s.x_cost[base + place] = s.x_left[base + place] = load.costs[cost + place]
     if len(load.holds) > 0:
         for place in range(t.n_region[dag]):
             s.x_holds[base + place] = load.holds[cost + place]
-    rules.make_ready(t, s, key, base + source, now)
+    make_ready(t, s, key, base + source, now)
 
 
 def _dispatch(
     t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Load,
-    o: Orders, now: int, finish_at: list[int], running: list[int], since: list[int],
-    busy: list[int], log: list[LogEntry],
+    o: Orders, now: int,
 ) -> None:
-    """Dispatch executions; ``running`` has the preempted executions for the log."""
+    """Dispatch executions; ``Pool.running`` has the preempted ones for the log."""
     sends, stops = len(load.delay_base) > 0, is_used(m)
     if stops:
         decide(t, s, p, m, now)
     x = dispatch(t, s, p, key, now)
     while x >= 0:
         worker = s.x_worker[x]
-        finish_at[worker] = now + s.x_left[x]
-        if since[worker] >= 0:
-            busy[worker] += now - since[worker]
-        since[worker] = now
+        p.finish_at[worker] = now + s.x_left[x]
+        if p.since[worker] >= 0:
+            p.busy[worker] += now - p.since[worker]
+        p.since[worker] = now
         if o.keep_log != 0:
-            if running[worker] >= 0:
-                _note(t, s, log, now, PREEMPT, worker, running[worker])
-            _note(t, s, log, now, START, worker, x)
-        running[worker] = x
+            if p.running[worker] >= 0:
+                _note(t, s, p, now, PREEMPT, worker, p.running[worker])
+            _note(t, s, p, now, START, worker, x)
+        p.running[worker] = x
         if stops:
             starts(s, load, m, x, now)
         if sends:
@@ -239,16 +231,14 @@ def _dispatch(
         x = dispatch(t, s, p, key, now)
 
 
-def _note(
-    t: Tables, s: State, log: list[LogEntry], now: int, kind: int, worker: int, x: int
-) -> None:
+def _note(t: Tables, s: State, p: Pool, now: int, kind: int, worker: int, x: int) -> None:
     vertex = s.x_vertex[x]
-    log.append((now, kind, worker, t.dag_of[vertex], vertex, s.job_index[s.x_slot[x]]))
+    p.log.append((now, kind, worker, t.dag_of[vertex], vertex, s.job_index[s.x_slot[x]]))
 
 
 def any_missed(s: State, first: int) -> bool:
     """Return whether a miss is among the decisions from number ``first`` on."""
     for i in range(first, len(s.decisions)):
-        if jobs.is_miss(s.decisions[i][0]):
+        if is_miss(s.decisions[i][0]):
             return True
     return False

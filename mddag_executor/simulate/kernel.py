@@ -33,6 +33,7 @@ _KINDS = {
     'list[list[int]]': VectorType(nested=True),
     'list[list[QueueEntry]]': VectorType(5, nested=True),
     'list[Decision]': VectorType(6),
+    'list[LogEntry]': VectorType(6),
 }
 
 
@@ -44,15 +45,20 @@ def _structure(row: Any, **more: Any) -> Any:
     return StructureType(row.__name__, {**fields, **more})
 
 
+KINDS: dict[str, Any] = {
+    **_KINDS, 'Tables': _structure(Tables, policy=types.int64),
+    **{row.__name__: _structure(row)
+       for row in (State, Pool, Load, Deliveries, Machine, Orders)}}
+"""The types of compiled code, by the annotations of the source."""
+
 # Functions for compiled code that turn an address into a structure or vector.
-as_tables = at(_structure(Tables, policy=types.int64))
-as_state = at(_structure(State))
-as_pool = at(_structure(Pool))
-as_load = at(_structure(Load))
-as_deliveries = at(_structure(Deliveries))
-as_machine = at(_structure(Machine))
-as_orders = at(_structure(Orders))
-as_log = at(VectorType(6))
+as_tables = at(KINDS['Tables'])
+as_state = at(KINDS['State'])
+as_pool = at(KINDS['Pool'])
+as_load = at(KINDS['Load'])
+as_deliveries = at(KINDS['Deliveries'])
+as_machine = at(KINDS['Machine'])
+as_orders = at(KINDS['Orders'])
 as_vector = at(VectorType())
 STATE_FIELDS = len(State._fields)
 POOL_FIELDS = len(Pool._fields)
@@ -86,7 +92,7 @@ def bind_policies(space: dict[str, Any]) -> None:
 
 def run_each(
     tables: int, load: int, orders: int, state: int, pool: int, deliveries: int, machine: int,
-    busy: int, log: int, missed: int,
+    missed: int,
 ) -> int:
     """
     Run a load with one row of execution times after another; return when the last run ended.
@@ -99,17 +105,17 @@ def run_each(
     ended = 0
     for number in range(len(misses)):
         if number > 0:
-            free_run(state, pool, deliveries, machine, busy, log)
+            free_run(state, pool, deliveries, machine)
             for dag in range(len(rows.cost_base)):
                 rows.cost_base[dag] += t.n_vertices
         ended = run(
             t, s, as_pool(pool), as_deliveries(deliveries), as_machine(machine), key_of_policy,
-            rows, as_orders(orders), as_vector(busy), as_log(log), None)
+            rows, as_orders(orders), None)
         misses[number] = int(any_missed(s, 0))
     return ended
 
 
-def free_run(state: int, pool: int, deliveries: int, machine: int, busy: int, log: int) -> None:
+def free_run(state: int, pool: int, deliveries: int, machine: int) -> None:
     """Free the results of a run."""
     s, m = as_state(state), as_machine(machine)
     for group in range(len(s.group_heap)):
@@ -117,7 +123,6 @@ def free_run(state: int, pool: int, deliveries: int, machine: int, busy: int, lo
     for process in range(len(m.lock_queue)):
         free(m.lock_queue[process])
     for structure, fields in ((state, STATE_FIELDS), (pool, POOL_FIELDS),
-                              (deliveries, DELIVERIES_FIELDS), (machine, MACHINE_FIELDS),
-                              (busy, 1), (log, 1)):
+                              (deliveries, DELIVERIES_FIELDS), (machine, MACHINE_FIELDS)):
         for field in range(fields):
             free(as_vector(structure + 24 * field))

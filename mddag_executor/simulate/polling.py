@@ -22,9 +22,9 @@ from __future__ import annotations
 
 from heapq import heappush
 
-from mddag_executor.core import rules
 from mddag_executor.core.policies import Key
 from mddag_executor.core.queues import first_of, may_start
+from mddag_executor.core.rules import take
 from mddag_executor.core.state import N_IDLE, ORDER, State
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.simulate.pool import idle_worker, in_round, POLLED_UNTIL, Pool
@@ -59,7 +59,7 @@ def take_polled(t: Tables, s: State, p: Pool, now: int) -> int:
     entry = s.ready[place]
     s.ready.clear()
     s.ready.append(entry)
-    x = rules.take(t, s, idle_worker(s, p, 1), now)
+    x = take(t, s, idle_worker(s, p, 1), now)
     for i in range(len(p.aside)):
         heappush(s.ready, p.aside[i])
     p.aside.clear()

@@ -16,10 +16,25 @@ from mddag_executor.core.tables import NEVER, Tables
 PREEMPTIVE, POLLING, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLED_UNTIL = range(5)
 
 
+# Kinds of log entries.
+START, END, PREEMPT = range(3)
+
+LogEntry = tuple[int, int, int, int, int, int]
+"""(time, kind, worker, DAG, global vertex, job): one change of a worker."""
+
+
 class Pool(NamedTuple):
     """Everything that changes about the workers during a run; filled by ``fill_pool``."""
 
     scalars: list[int]
+    # by worker: when its execution ends; since when it runs it; how long it has run any; the
+    # execution that it was dispatched last, if that has not ended
+    finish_at: list[int]
+    since: list[int]
+    busy: list[int]
+    running: list[int]
+    # every start, end and preemption, if wanted
+    log: list[LogEntry]
     # if there are several processes: the process of each worker, from 1
     process: list[int]
     # under a policy that polls, by queue: the order number of its entry in the present round
@@ -42,6 +57,11 @@ def fill_pool(
     """
     for value in (preemptive, polling, dispatch_overhead, switch_overhead, 0):
         p.scalars.append(value)
+    for _ in range(len(s.worker_x)):
+        p.finish_at.append(NEVER)
+        p.since.append(-1)
+        p.busy.append(0)
+        p.running.append(-1)
     if polling != 0:
         for _ in range(len(s.queue_first)):
             p.polled.append(-1)

@@ -20,12 +20,12 @@ from mddag_executor.core.state import (
     State,
 )
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import LogEntry, Orders, run
+from mddag_executor.simulate.engine import Orders, run
 from mddag_executor.simulate.load import as_list, as_lists, Load
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.policies import policy as find_policy
 from mddag_executor.simulate.policies import preempts, ROS2
-from mddag_executor.simulate.pool import Pool
+from mddag_executor.simulate.pool import LogEntry, Pool
 
 # Approximate time of plain Python per execution, without and with a machine, to choose the faster.
 PLAIN_S, _STOPS_S = 10e-6, 50e-6
@@ -152,12 +152,11 @@ def schedule(
         from mddag_executor.simulate.compiled import run_each
         return Scheduled(*run_each(tables, load, settings.policy, orders)[0])
     state = as_object(empty(State))
-    entries: list[LogEntry] = []
-    busy: list[int] = []
+    pool = empty(Pool)
     ended = run(
-        as_object(tables), state, empty(Pool), empty(Deliveries), empty(Machine),
-        find_policy(settings.policy).key, as_lists(load), orders, busy, entries, progress)
-    return Scheduled(ended, entries, state.decisions, busy)
+        as_object(tables), state, pool, empty(Deliveries), empty(Machine),
+        find_policy(settings.policy).key, as_lists(load), orders, progress)
+    return Scheduled(ended, pool.log, state.decisions, pool.busy)
 
 
 def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:

@@ -14,9 +14,10 @@ types here have the same source interface and the cost of C:
   64-bit integer, or a tuple of them, or a vector.  ``append`` grows the data with ``realloc``;
 * a *structure* is the address of three words for each field: those of a vector, or an integer.
 
-There are no reference counts and no checks: an index must be from 0 to below the length.  (Tests
-compare with the plain core on lists, for which Python checks.)  The code that makes a structure
-frees it with ``free``, or provides memory that stays in place while the structure is used.
+There are no reference counts, no exceptions (without memory the program ends) and no checks: an
+index must be from 0 to below the length.  (Tests compare with the plain core on lists, for which
+Python checks.)  The code that makes a structure frees it with ``free``, or provides memory that
+stays in place while the structure is used.
 
 This module needs numba; nothing is compiled when it is imported.
 """
@@ -32,7 +33,15 @@ from numba import njit, types
 from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.cpython.heapq import _siftdown, _siftup
-from numba.extending import intrinsic, models, overload, overload_method, register_model
+from numba.extending import (
+    intrinsic,
+    lower_builtin,
+    models,
+    overload,
+    overload_method,
+    register_model,
+    type_callable,
+)
 
 WORDS = 3
 """Words of a vector, and of a field."""
@@ -73,7 +82,7 @@ class StructureType(types.Type):
     def __init__(self, name: str, fields: dict[str, types.Type]) -> None:
         self.fields = fields
         self.places = {field: i for i, field in enumerate(fields)}
-        super().__init__(name=f'mddag.Structure({name}: {fields})')
+        super().__init__(name=f'mddag.{name}')  # short: it is part of the name of each function
 
 
 class AddressModel(models.PrimitiveModel):
@@ -120,32 +129,64 @@ def _get_field(context: Any, builder: Any, structure: Any, address: Any, name: s
 lower_getattr_generic(StructureType)(_get_field)
 
 
-@intrinsic
-def _load(typing: Any, vector: Any, index: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        element = _element(builder, vector, *args)
-        if vector.nested:
-            return element
-        if not vector.width:
-            return builder.load(_pointer(builder, element))
-        words = [builder.load(_word(builder, element, i)) for i in range(vector.width)]
-        return context.make_tuple(builder, vector.element, words)
+# Elements and lengths are typed and generated here, not as ``overload`` functions: each of those
+# is compiled for each type of vector, and called and inlined at each use.
 
-    return vector.element(vector, types.int64), generate
+@type_callable(operator.getitem)
+def _type_get_item(context: Any) -> Any:
+    def typer(vector: Any, index: Any) -> Any:
+        fits = isinstance(vector, VectorType) and isinstance(index, types.Integer)
+        return vector.element if fits else None
+
+    return typer
 
 
-@intrinsic
-def _store(typing: Any, vector: Any, index: Any, value: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        element = _element(builder, vector, args[0], args[1])
-        if not vector.width:
-            builder.store(args[2], _pointer(builder, element))
-        for i in range(vector.width):
-            word = builder.extract_value(args[2], i)
-            builder.store(word, _word(builder, element, i))
-        return context.get_dummy_value()
+@lower_builtin(operator.getitem, VectorType, types.Integer)
+def _get_item(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    vector, index = signature.args
+    place = context.cast(builder, args[1], index, types.int64)
+    element = _element(builder, vector, args[0], place)
+    if vector.nested:
+        return element
+    if not vector.width:
+        return builder.load(_pointer(builder, element))
+    words = [builder.load(_word(builder, element, i)) for i in range(vector.width)]
+    return context.make_tuple(builder, vector.element, words)
 
-    return types.void(vector, types.int64, vector.element), generate
+
+@type_callable(operator.setitem)
+def _type_set_item(context: Any) -> Any:
+    def typer(vector: Any, index: Any, value: Any) -> Any:
+        fits = isinstance(vector, VectorType) and isinstance(index, types.Integer)
+        return types.void if fits else None
+
+    return typer
+
+
+@lower_builtin(operator.setitem, VectorType, types.Integer, types.Any)
+def _set_item(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    vector, index, kind = signature.args
+    place = context.cast(builder, args[1], index, types.int64)
+    value = context.cast(builder, args[2], kind, vector.element)
+    element = _element(builder, vector, args[0], place)
+    if not vector.width:
+        builder.store(value, _pointer(builder, element))
+    for i in range(vector.width):
+        builder.store(builder.extract_value(value, i), _word(builder, element, i))
+    return context.get_dummy_value()
+
+
+@type_callable(len)
+def _type_length(context: Any) -> Any:
+    def typer(vector: Any) -> Any:
+        return types.int64 if isinstance(vector, VectorType) else None
+
+    return typer
+
+
+@lower_builtin(len, VectorType)
+def _length(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    return builder.load(_word(builder, args[0], 1))
 
 
 @intrinsic
@@ -167,6 +208,8 @@ def _set_word(typing: Any, vector: Any, place: Any, value: Any) -> Any:
 
 _realloc = types.ExternalFunction('realloc', types.int64(types.int64, types.int64))
 _free = types.ExternalFunction('free', types.void(types.int64))
+_perror = types.ExternalFunction('perror', types.void(types.int64))
+_exit = types.ExternalFunction('exit', types.void(types.int64))
 
 
 def at(kind: types.Type) -> Callable[..., Any]:
@@ -189,7 +232,8 @@ def _grow(vector, words):
     capacity = max(8, 2 * _get_word(vector, 2))
     data = _realloc(_get_word(vector, 0), capacity * words * 8)
     if data == 0:
-        raise MemoryError('no memory for the simulation')
+        _perror(0)
+        _exit(1)
     _set_word(vector, 0, data)
     _set_word(vector, 2, capacity)
 
@@ -207,24 +251,9 @@ def _for_vectors(operation: Any, *kinds: Any) -> Callable[[Any], Any]:
     return register
 
 
-@_for_vectors(operator.getitem, types.Integer)
-def _get_item(vector, index):
-    return _load(vector, index)
-
-
-@_for_vectors(operator.setitem, types.Integer)
-def _set_item(vector, index, value):
-    _store(vector, index, value)
-
-
 @_for_vectors(operator.delitem, types.SliceType)
 def _truncate(vector, index):
     _set_word(vector, 1, index.start)   # del vector[start:]
-
-
-@_for_vectors(len)
-def _length(vector):
-    return _get_word(vector, 1)
 
 
 @_for_vectors(bool)
@@ -248,8 +277,8 @@ def _overload_append(vector: Any, value: Any) -> Any:
         length = _get_word(vector, 1)
         if length == _get_word(vector, 2):
             _grow(vector, words)
-        _store(vector, length, value)
         _set_word(vector, 1, length + 1)
+        vector[length] = value
 
     return append
 
@@ -259,7 +288,7 @@ def _overload_pop(vector: Any) -> Any:
     def pop(vector):
         length = _get_word(vector, 1) - 1
         _set_word(vector, 1, length)
-        return _load(vector, length)
+        return vector[length]
 
     return pop
 
