@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
@@ -126,13 +126,14 @@ class Search:
     """
     Searches the greatest factors of a problem.
 
-    :param compiled: whether the core runs compiled.
+    :ivar compiled: whether the core runs compiled.
     :ivar missed: by sink the number of missed deadlines with factor 1.
     :ivar left_out: sinks that miss all of them with any factor.
     """
 
-    def __init__(self, problem: Problem, compiled: bool = False) -> None:
-        self._problem, self._compiled = problem, compiled
+    def __init__(self, problem: Problem) -> None:
+        self._problem, self.compiled = problem, False
+        self.compile_for(_RUNS)
         load: Any = as_arrays(problem.load)
         self._load = load
         self._dispatches = np.zeros_like(load.costs)
@@ -166,6 +167,17 @@ class Search:
                 tables=self._problem.tables._replace(sink_deadline=deadlines))
             self._known = {(vertex, job) for vertex, job in self._known if vertex in met}
 
+    def compile_for(self, runs: int) -> None:
+        """
+        Compile the core if it pays for so many runs of the whole load.
+
+        If one callback alone cannot help, its search needs no such run.  So this is called when it
+        is known that the searches take long: compiling takes minutes on a busy machine.
+        """
+        if runs and not self.compiled:
+            self.compiled = prepare(
+                self._problem.tables, self._problem.load, self._problem.settings, runs)
+
     @property
     def misses(self) -> bool:
         """Return whether deadlines are missed with factor 1, so that factors are below 1."""
@@ -191,7 +203,7 @@ class Search:
             problem.settings, duration_ns=min(end, problem.settings.duration_ns),
             stop_at_first_miss=stop)
         with gc_paused():
-            return schedule(problem.tables, load, settings, compiled=self._compiled).decisions
+            return schedule(problem.tables, load, settings, compiled=self.compiled).decisions
 
     def _misses(self, load: Load, end: int, stop: bool) -> list[Miss]:
         """Return the additional misses."""
@@ -329,25 +341,21 @@ def find_slack(
     :param progress: called with the number of finished callbacks.
     :param jobs: number of processes for long searches.
     """
-    compiled = prepare(problem.tables, problem.load, problem.settings,
-                       _RUNS * len(set(problem.callback_of)))
-    search = Search(problem, compiled)
+    search = Search(problem)
+    progress(0)
     rest = sorted(set(problem.callback_of))
     found = {ALL: search.factor(ALL)}
+    progress(0)
     begin, quick = time.monotonic(), True
-    while rest and (quick or jobs == 1):
+    while rest and quick:
         callback = rest.pop(0)
         found[callback] = _factor(search, callback)
         progress(len(found) - 1)
         quick = (time.monotonic() - begin) * len(rest) < _FEW_S * (len(found) - 1)
-    if rest:
-        number = min(len(rest), jobs)
-        spawn = multiprocessing.get_context('spawn')
-        with ThreadPoolExecutor(number) if compiled else \
-                ProcessPoolExecutor(number, spawn, _start) as pool:
-            for callback, one in zip(rest, pool.map(partial(_factor, search), rest)):
-                found[callback] = one
-                progress(len(found) - 1)
+    search.compile_for(_RUNS * len(rest))
+    for callback, one in zip(rest, _factors(search, rest, min(len(rest), jobs))):
+        found[callback] = one
+        progress(len(found) - 1)
     return Slack(found, search.missed, search.left_out,
                  {of: search.fewer(of) for of in ('workers', 'cpus')})
 
@@ -396,6 +404,17 @@ def slack_result(
             name: one for path in as_dags(requirements).values()
             for name, one in margins(path['sinks']).items()}
     return result
+
+
+def _factors(search: Search, callbacks: list[int], jobs: int) -> Iterator[Found]:
+    """Yield the factors of callbacks, searched in parallel."""
+    if jobs < 2:
+        yield from (_factor(search, callback) for callback in callbacks)
+        return
+    spawn = multiprocessing.get_context('spawn')
+    with ThreadPoolExecutor(jobs) if search.compiled else \
+            ProcessPoolExecutor(jobs, spawn, _start) as pool:
+        yield from pool.map(partial(_factor, search), callbacks)
 
 
 def _start() -> None:

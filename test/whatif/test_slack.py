@@ -170,8 +170,12 @@ def test_a_callback_that_does_not_help_costs_one_short_run(monkeypatch):
 
     schedule = module.schedule
     monkeypatch.setattr(module, 'schedule', counted)
+    compiled_for = []
+    monkeypatch.setattr(module, 'prepare', lambda *each: compiled_for.append(each[-1]))
     slack = find_slack(Problem(load, settings, Tables.build(task_set),
                                task_set.places_of_vertices()))
     factors = [found.factor for number, found in sorted(slack.factors.items())]
     assert 0.44 <= factors[0] <= 0.45 and factors[1:] == [0] * 20
     assert sum(length > 1000 for length in lengths) < 10
+    # nor is anything compiled for runs of all callbacks
+    assert compiled_for == [module._RUNS]
