@@ -144,7 +144,9 @@ class UndeclaredRun(ImportedRun):
     links_type = _OwnLinks
     odd = {**OFF_THE_GRID, 'off': (
         'execution', 'of timers whose due times are not recorded and that kept to no period '
-        '(reset, or by another clock): released when they were noticed')}
+        '(reset, or by another clock): released when they were noticed'), 'skipped': (
+        'release', 'of timers skipped, as the one before began later than they were due: without '
+        'a job, so they do not count as missed')}
 
     def _number_pieces(self, table: Table) -> None:
         number_pieces(table, np.arange(len(table)), 'callback', table['completes'] == NOTHING)
@@ -192,6 +194,9 @@ class UndeclaredRun(ImportedRun):
             times = np.unique(ready[mine[due[mine] == 0]])
             if callback.kind == 'timer' and len(times):
                 callback.grid = _grid(times, callback.period)
+            if callback.kind == 'timer':
+                self._odd.count('skipped', callback.label, self._skipped(
+                    mine[due[mine] > 0], callback.period))
         # the time at which a request was taken is not recorded
         release = self._releases(jobs, ready, 'timer', 'service')
         timer = self._is_any('timer')[number[jobs.sources]]
@@ -199,6 +204,15 @@ class UndeclaredRun(ImportedRun):
         mine = jobs.sources[timer]
         release[timer] = self._due(mine, ready[mine])
         return ready, np.where(due[jobs.sources] > 0, due[jobs.sources], release)
+
+    def _skipped(self, which: Ints, period: int) -> int:
+        """Return how many releases of a timer were skipped because of late executions."""
+        due, first = np.unique(self.links.runs['due'][which], return_index=True)
+        if period <= 0 or len(due) < 2:
+            return 0
+        gaps = np.rint(np.diff(due) / period).astype(np.int64) - 1  # also while it was cancelled
+        late = (self.links.runs['start'][which[first]] - due)[:-1] // period
+        return int(np.maximum(0, np.minimum(gaps, late)).sum())
 
     def _pieces(self) -> tuple[Ints, Mask]:
         """Return the first pieces of executions, and which end them (rule 4)."""

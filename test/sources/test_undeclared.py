@@ -238,7 +238,8 @@ def test_the_grid_of_a_timer_is_found_though_few_releases_were_noticed_soon(run)
         run.detects(at + 1, 1)
     result = run.result(2600)
     sink = of_camera(result)
-    assert not result['warnings'] and not result['drift']
+    assert not result['warnings']
+    assert [each['callback'] for each in result['drift']] == ['/radar:scan']   # it never ran
     assert sink['breakdown']['mean']['release_lag_ns'] == sum(late) * MS // len(late)
     assert sink['late'] == sum(more + 2.101 > 40 for more in late)
 
@@ -254,6 +255,19 @@ def test_a_recorded_due_time_is_the_release(run):
     assert not result['warnings']
     assert sink['breakdown']['worst']['release_lag_ns'] == 17 * MS
     assert sink['breakdown']['mean']['release_lag_ns'] == 13.5 * MS
+
+
+def test_skipped_releases_of_timers_are_no_jobs_and_a_warning_counts_them(run):
+    # the first execution is late by 2.5 periods; then the timer is cancelled for a while
+    for due, start in ((0, 250), (300, 301), (400, 401), (1200, 1201)):
+        run.runs(GRAB, start, start + 2, start + 1, due=due)
+        run.detects(start + 1, 1)
+    result = run.result(1300)
+    sink = of_camera(result)
+    assert (sink['completed'], sink['late']) == (4, 1)
+    warning, = result['warnings']
+    assert ': 2 releases of timers skipped, as the one before began later' in warning
+    assert warning.endswith('/camera timer 100ms (2)')
 
 
 def test_actions_and_dropped_messages_are_no_damage(run):
