@@ -32,6 +32,8 @@ from mddag_executor.executor.work import Work
 from msg_graph.binding import Entity as Declarable
 from rclpy.qos import HistoryPolicy
 
+_MOST_FOREIGN = 8
+"""So many responses to other clients are expected before one's own when one begins to listen."""
 SERVICE_DEPTH = 10
 """How many requests wait in Python at most: the depth of rclpy's default profile for services."""
 
@@ -46,6 +48,8 @@ class ArrivalEntity(ListenerEntity):
     __slots__ = ('_take',)
 
     _take: Callable[[], Any]
+    hears_others = False
+    """Whether arrivals may be for others, so that taking one gives None before the last one."""
 
     def collect(self, left: int = 0) -> None:
         """
@@ -61,6 +65,7 @@ class ArrivalEntity(ListenerEntity):
                     return  # another thread has collected it
             if self.removed:
                 return  # another executor may have it now
+            misses = (left if left < MANY else _MOST_FOREIGN) if self.hears_others else 1
             for _ in range(left if left < MOST else MOST):
                 if 0 < self.most_waiting <= len(self.waiting):
                     self.collect_more = partial(self.collect, MANY)
@@ -68,7 +73,10 @@ class ArrivalEntity(ListenerEntity):
                 left -= 1
                 taken = take()
                 if taken is None:
-                    return
+                    misses -= 1
+                    if not misses:
+                        return
+                    continue
                 self.post(taken)
         except compat.RCL_ERRORS as error:
             if not compat.alive(self.rclpy_object):
@@ -315,6 +323,7 @@ class ClientEntity(ArrivalEntity):
     kind = 'client'
     list_name = 'clients'
     names_type = False
+    hears_others = True  # the responses to all clients of the service
 
     __slots__ = ()
 

@@ -14,8 +14,10 @@ from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
 
 from .conftest import matched, Spinning, wait_for
 from .declared import graph
@@ -201,3 +203,24 @@ def test_a_publishing_callback_wakes_the_workers_of_another_executor(make_execut
         nodes[0].create_timer(0.001, publish)
         assert wait_for(lambda: len(waited) >= 5, 60.0)
     assert all(waited)
+
+
+def test_each_client_of_a_service_gets_its_own_response(ros_context, make_executor, make_node):
+    """All clients of a service hear all responses; one's own may come after another one's."""
+    server, node = SingleThreadedExecutor(context=ros_context), make_node('asks')
+    serving = make_node('serves')
+    serving.create_service(Trigger, 'served', lambda request, response: response)
+    server.add_node(serving)
+    executor = make_executor()
+    clients = [node.create_client(Trigger, 'served') for _ in range(3)]
+    assert all(client.wait_for_service(30.0) for client in clients)
+    executor.add_node(node)
+    executor.spin_once(0.0)
+    for _ in range(3):
+        futures = [client.call_async(Trigger.Request()) for client in reversed(clients)]
+        for _ in futures:
+            server.spin_once(5.0)
+        for future in futures:
+            executor.spin_until_future_complete(future, 5.0)
+        assert all(future.done() for future in futures)
+    server.shutdown()

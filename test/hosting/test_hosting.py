@@ -221,6 +221,17 @@ def test_what_was_exclusive_stays_exclusive(world, mddag, monkeypatch):
     assert any(line.startswith('callbacks of --node overlap:spins waited ') for line in says)
 
 
+def test_callbacks_and_tasks_of_programs_may_await_asyncio(world, mddag, monkeypatch):
+    monkeypatch.setenv('PYTHONPATH', str(GUESTS), prepend=os.pathsep)
+    for name, says in (
+        ('serves_slowly', "['slept', 'slept'] 2 True"),
+        ('runs_steps', 'starboard\nport\nnot that far'),
+        ('fails_in_a_step', 'rudder stuck'), ('polls_in_a_loop', '1.5'),
+    ):
+        done = mddag('run', '-q', '--node', f'coroutines:{name}')
+        assert (done.returncode, done.stdout) == (0, f'{says}\n'), done.stderr
+
+
 def test_nodes_may_be_concurrent(world, mddag, monkeypatch):
     monkeypatch.setenv('PYTHONPATH', str(GUESTS), prepend=os.pathsep)
     for given, arguments in (('', ['--concurrent', 'spins', '--concurrent', '/spins_other']),
