@@ -22,6 +22,7 @@ import pytest
 from ..conftest import examples
 from ..sources.helpers import Chances, declarations, MS, PATHS, SMALL, VirtualRun
 from .oracle import Oracle
+from .told import Told
 
 DEMO = Path(__file__).resolve().parents[2] / 'bags' / 'demo_short.mcap'
 
@@ -259,3 +260,35 @@ def test_a_finished_recording_is_not_written(tmp_path):
                             (recording.columns, 'releases')):
             with pytest.raises(FrozenInstanceError):
                 setattr(each, field, None)
+
+
+TWO_RATES = """\
+mddag: 1
+nodes:
+  - {node: /lidar, callbacks: [{name: read, timer: 100ms, publishes: [/points]}]}
+  - {node: /boxes, callbacks: [{name: find, timer: 70ms, publishes: [/boxes], deadline: 1s}]}
+  - node: /fusion
+    callbacks:
+      - name: fuse
+        sync: {topics: [/points, /boxes], driven_by: /points}
+        publishes: [/fused]
+  - {node: /brake, callbacks: [{name: stop, subscription: /fused, deadline: 150ms}]}
+"""
+
+
+@pytest.mark.parametrize('has_stamps', [True, False])
+def test_an_imported_sync_of_two_rates(tmp_path, has_stamps):
+    """Two scans wait, and the first boxes are fused with the older one."""
+    told = Told(tmp_path / 'a.mcap', TWO_RATES)
+    for at in 0, 100:
+        told.ran('/lidar:read', at, at + 2, sends=[(at + 1, '/points', has_stamps * (at + 5))])
+        told.ran('/fusion:fuse', at + 3, at + 4, at + 1, '/points')
+    for at, scan in (130, 0), (200, 100):
+        told.ran('/boxes:find', at, at + 2, sends=[(at + 1, '/boxes', at)])
+        told.ran('/fusion:fuse', at + 3, at + 10, at + 1, '/boxes',
+                 [(at + 9, '/fused', has_stamps * (scan + 5))])
+        told.ran('/brake:stop', at + 11, at + 12, at + 9, '/fused')
+    result = Replay(open_recording(told.write(), told.task_set)).result()
+    response = result['dags']['/lidar']['sinks']['/brake:stop']['response_ns']
+    assert (response['min'] // MS, response['max'] // MS) == (112 if has_stamps else 42, 142)
+    assert result.get('guessed', {}) == ({} if has_stamps else {'/fusion:fuse': 1})

@@ -45,8 +45,10 @@ class Told(Recorded):
         return tid
 
     def sent(self, key, tid, *sends):
-        for time, topic in sends:
-            self.publish(self.publishers[key, topic], tid, time * MS, stamp=time * MS)
+        """Publish at times on topics, each perhaps with a header stamp."""
+        for time, topic, *header in sends:
+            self.publish(self.publishers[key, topic], tid, time * MS, stamp=time * MS,
+                         header=header[0] * MS if header else 0)
 
     def paths(self):
         return Paths(open_recording(self.write(), self.task_set))

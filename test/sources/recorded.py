@@ -112,7 +112,7 @@ class Recorded:
         self.add('ros2:callback_start', start, tid, callback, within, pid=pid)
         self.add('ros2:callback_end', end, tid, callback, pid=pid)
 
-    def publish(self, handle, tid, time, stamp=None, style='caret', pid=1):
+    def publish(self, handle, tid, time, stamp=None, style='caret', pid=1, header=0):
         """
         Add a publication and return its source timestamp (ns since `BEGIN`).
 
@@ -128,7 +128,7 @@ class Recorded:
         if style == 'tracing':
             add('ros2:rclcpp_publish', 0, 0, message, 0)
         elif style != 'rclpy':
-            add('ros2:rclcpp_publish', 0, handle, message, 0)
+            add('ros2:rclcpp_publish', 0, handle, message, BEGIN + header if header else 0)
         add('ros2:rcl_publish', 5, handle, message)
         if style == 'tracing':
             add('ros2:rmw_publish', 6, message, BEGIN + stamp)
