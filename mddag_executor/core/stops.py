@@ -71,9 +71,12 @@ class Stops:
         :param completed: -1: never.
         """
         miss = _Miss(release, deadline, completed, what)
-        if any(miss.is_explained_by(begin, end) for begin, end in self._latest):
-            self._misses += 1
-            return True
+        for begin, end in reversed(self._latest):
+            if end < release:
+                break  # so did all stops before it: they explain nothing
+            if miss.is_explained_by(begin, end):
+                self._misses += 1
+                return True
         self._unexplained.append(miss)
         return False
 
