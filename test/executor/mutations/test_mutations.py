@@ -141,7 +141,7 @@ client.completed = getattr(client, 'completed', 0) + 1
             'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done[installed]')],
         every=True),
     Case('what_was_lent_is_not_returned', [(
-        'executor/workers.py', 'if lends and me.thread is not None:', 'if False:')], of(
+        'executor/lending.py', 'if lends and me.thread is not None:', 'if False:')], of(
         'test_gil.py', 'test_others_wait_for_a_callback_that_goes_on',
         'test_a_callback_that_has_lent_its_worker_goes_on_in_order[1]',
         'test_a_callback_that_has_lent_its_worker_goes_on_in_order[7]'), every=True),
