@@ -59,7 +59,7 @@ class Awaiting(Generic[JobType]):
         self._jobs: dict[JobType, None] = {}
         # those of which an output has carried the stamp of the driving message
         self._named: dict[JobType, None] = {}
-        # by header stamp of a driving message its job, also if it has been answered
+        # by header stamp of a driving message its job, even if it has been answered
         self._stamped: dict[int, JobType] = {}
 
     def hear(self, topic: str) -> None:

@@ -46,7 +46,7 @@ def broken_invariants(t: Tables, s: State) -> Iterator[str]:
 
 def _all_heaps(s: State) -> Iterator[tuple[str, int, list[QueueEntry]]]:
     yield 'the ready heap', READY, s.ready
-    yield 'what is held back', HELD_BACK, s.held_back
+    yield 'the heap of deferred entries', HELD_BACK, s.held_back
     for group, heap in enumerate(s.group_heap):
         yield f'the heap of group {group}', group, heap
     for outer, heap in enumerate(s.outer_heap):

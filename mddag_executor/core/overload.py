@@ -30,12 +30,13 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import IMPORTANT, NEVER, Tables
 
-LATE_PATIENCE = 10
+LATE_PATIENCE = 8
 """
-A demoted job is ordered as if it were released this many relative deadlines after that.
+A late queue is ordered as if it were released this many relative deadlines later.
 
-So its callbacks run, however long the overload lasts, with about a tenth of what they need.
-Less important work gives way to a late sink for as many of the sink's relative deadlines.
+It is found late at the latest one deadline after its release, and runs at the latest one deadline
+after its new release.  So each callback starts about once in ten of its relative deadlines,
+however long the overload lasts.  Less important work gives way to a late sink for as many.
 """
 PPM = 1_000_000
 

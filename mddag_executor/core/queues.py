@@ -5,28 +5,33 @@ The queues in which executions wait: rules 3, 4 and 10 (see ``rules``).
 
 Theory of operation
 -------------------
-Each callback has a *queue*: a vertex has one (with legs, each leg), and so has each undeclared
-callback of a live run.  Executions that have not started wait in it in the order of their keys: a
-list linked by ``State.x_next``, to which nearly all are appended.  Its first execution runs first.
-So messages of a callback keep their order, whatever happens to keys.  A queue that is not empty
-has exactly one *entry*, with the key of the queue (``State.queue_key``).  That is the smallest key
-of its executions, also of those that were dropped since the last one started, or the one by rule 7
-if it is late.  So age and place belong to the queue, and dropping an execution costs nothing.
+Each callback has a *queue*: a vertex has one (with legs, each leg has one), and so has each
+undeclared callback of a live run.  Executions that have not started wait in their queue in the
+order of their keys.  The queue is a list linked by ``State.x_next``, and nearly every execution is
+appended at its end.  The first execution of a queue runs first.  So messages of a callback keep
+their order, even if keys change.
 
-An execution that has begun (it was preempted or refused, or goes on after it has waited) waits
-*alone*: it has an entry of its own, and does not stop those in the queue.  So does an undeclared
-one without a queue (simulation).
+A queue that is not empty has exactly one *entry* in a heap, with the key of the queue
+(``State.queue_key``).  The key of a queue is the smallest key of its executions, including those
+that were dropped since the last one started.  If the queue is late, rule 7 gives its key.  So age
+and place belong to the queue, and dropping an execution costs nothing.
 
-Each entry is in exactly one of
+An execution that has begun waits *alone*: it was preempted or refused, or it goes on after it has
+waited.  It has an entry of its own, and does not stop the executions in the queue.  In simulation,
+an undeclared execution has no queue, and waits alone as well.
 
-* the ready heap (``State.ready``), by the keys of the policy;
-* the heap of a callback group (``State.group_heap``), if the group was busy when it came first;
-* the heap of an outer group (``State.outer_heap``), if that had no place when it came first;
-* the heap of what is deferred (``State.held_back``), if an execution as urgent held the
-interpreter when it came first.
+Each entry is in exactly one of these heaps:
 
-An entry whose key changes is replaced where it is, so no heap has an outdated one.  It nearly
-always is the first one; for any other the heap is searched, which is rare.
+* the ready heap (``State.ready``), in the order of the policy's keys;
+* the heap of a callback group (``State.group_heap``), if the group was busy when the entry came
+first;
+* the heap of an outer group (``State.outer_heap``), if the outer group had no place when the entry
+came first;
+* the heap of deferred entries (``State.held_back``), if an execution that is as urgent held the
+interpreter when the entry came first.
+
+An entry whose key changes is replaced in its heap, so no heap has an outdated entry.  Nearly
+always the changed entry is the first one; only for another one the heap is searched.
 """
 
 from __future__ import annotations
@@ -163,7 +168,7 @@ def has_place(s: State, x: int) -> bool:
         return True
     limit = s.outer_limit[outer]
     if limit < 1 and s.x_place[x] == RETURNS:
-        limit = 1  # one that has begun goes on, also if its group is closed
+        limit = 1  # an execution that has begun goes on, even if its group is closed
     return s.outer_running[outer] < limit
 
 

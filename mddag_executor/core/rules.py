@@ -5,104 +5,110 @@ The scheduling rules, all of them and only here (those about whole jobs are in `
 
 Theory of operation
 -------------------
-A driver (live executor, replayer, simulator) reports events with their times; the rules change the
-state and return decisions.  There is no clock, thread, ROS or file here.  Every function receives
+A driver (live executor, replayer, simulator) reports events with their times.  The rules change
+the state and return decisions.  There is no clock, thread, ROS or file here.  Every function gets
 the tables ``t`` and the state ``s``, and uses only integer arithmetic, list indexing and
 ``heapq``, so that the same source runs on plain lists and compiled on arrays.
 
 1.  **Release.**  ``release_job`` opens job J_x^k of a DAG.  At most ``max_active_jobs`` jobs of a
-    DAG are open; the oldest expires to make room.  An idle job (no execution of it waits or runs)
-    also expires ``expire_after`` past its latest deadline.
+    DAG are open: the oldest one expires to make room.  A job is idle if none of its executions
+    waits or runs.  An idle job expires ``expire_after`` past its latest deadline.
 2.  **Readiness.**  A vertex becomes ready when its join countdown reaches zero: all its
     predecessors have completed (AND).  Vertices that several publishers trigger are several
-    vertices (OR).  If sync callbacks run leg by leg (live), a leg is the message of one
-    predecessor and ready when that arrives.  The countdown happens at the leg's completion; the
-    last leg completes the vertex.
+    vertices (OR).  In a live run, a sync callback runs leg by leg.  A leg is the message of one
+    predecessor, and is ready when the message arrives.  The countdown happens when the leg
+    completes, and the last leg completes the vertex.
 3.  **Order.**  Each callback has a queue, in which its ready executions wait in the order of the
-    policy's keys, smallest first (``queues``); the first one runs first.  The queues wait in a
-    heap, each with its smallest key.  Ties go by the *order*, a running number given when an
-    execution becomes ready or is put back.  At one instant, as in the paper's own program,
-    completions come first, by worker, and of each its successors in reverse order of its edges;
-    then releases, by DAG; then, during dispatch, preempted executions.  An execution that goes on
-    after it was preempted or has waited (*resumes*) waits alone: it keeps the key of its job, but
-    an undeclared one counts from then on.
-4.  **Callback groups.**  A group has at most one owner, from its first dispatch to its completion
-    (also while preempted or suspended).  A queue that comes first while the group of its first
-    execution is busy is set aside in the group's heap; when the owner completes, the group's
-    smallest returns.  A user-defined group lets executions run one by one: if the owner may begin,
-    it leaves the group for good (``leave_group``); if not, it waits as the owner, so that no other
-    one overtakes it (``refuse``, then ``ask_again``).
-    Groups may belong to an *outer group* (live: the callbacks of a program's executor), of which
-    so many may run at a time, or none while it is closed (``open_outer``).  What comes first while
-    its outer group has no place is set aside in that group's heap.  An execution has a place while
-    it runs, but not while it is suspended, nor, if only one may run, while it has lent its worker:
-    it asks for one again, also of a closed group.
+    policy's keys, smallest first (``queues``).  The first execution of a queue runs first.  The
+    queues wait in a heap, each with its smallest key.  Ties go by the *order*: a running number
+    that an execution gets when it becomes ready or is put back.  At one instant, as in the paper's
+    own program, completions come first, by worker, and of each completion the successors in
+    reverse order of its edges; then releases, by DAG; then, during dispatch, preempted executions.
+    An execution that goes on after it was preempted or has waited (*resumes*) waits alone.  It
+    keeps the key of its job; the key of an undeclared one is counted from the time at which it
+    resumes.
+4.  **Callback groups.**  A group has at most one owner, from its first dispatch to its completion,
+    including the time in which it is preempted or suspended.  If a queue comes first while the
+    group of its first execution is busy, its entry is set aside in the heap of the group.  When
+    the owner completes, the smallest entry of the group returns.  A group of a user's own class
+    lets executions run one by one.  If the owner may begin, it leaves the group for good
+    (``leave_group``).  If it may not, it waits as the owner, so that no other execution overtakes
+    it (``refuse``, then ``ask_again``).
+    In a live run, callbacks of one of a program's executors belong to an *outer group*.  At most a
+    given number of them may run at a time, or none while the outer group is closed
+    (``open_outer``).  If a queue comes first while its outer group has no place, its entry is set
+    aside in the heap of the outer group.  An execution has a place while it runs, but not while it
+    is suspended, nor while it has lent its worker if only one may run.  Then it asks for a place
+    again, even if the group is closed.
 5.  **Workers.**  The execution that comes first goes to an idle worker (``take``), which the
     driver chooses.  Simulated workers may also be preempted, poll, or belong to several processes:
     see ``simulate.dispatch``.
-6.  **Verdicts.**  A sink that completes after its absolute deadline (release plus relative
-    deadline) is late; at the deadline it is in time.  ``finish`` judges open jobs at the end of
+6.  **Verdicts.**  A sink is late if it completes after its absolute deadline (release plus
+    relative deadline); at the deadline it is in time.  ``finish`` judges open jobs at the end of
     the run: an absolute deadline at or before the end was missed.  Each sink of a job gets one
     verdict.  For a driver with a clock (``deadlines``) a sink is *overdue* from its deadline to
-    its verdict, which is then not in time.  Jobs released less than ``SKIP`` after the first one
-    (warm-up), before ``JUDGE_FROM``, or not before ``JUDGE_UNTIL``, get no verdicts; live,
-    ``judge_from`` is called when all programs have started.
-7.  **Late queues.** ``CONTINUE`` lets late work go on as before.  ``DEMOTE`` lowers the priority
-    of a queue that comes first, if none of its executions can be in time at any of their sinks:
-    the time plus the mean execution times on the longest path to the sink is past its deadline.
-    Until one of it starts, the queue counts as released ``LATE_PATIENCE`` relative deadlines
-    later, and the job of its first execution does so at all later vertices.  So late work ages,
-    and each callback gets some time.  As long as another execution in the queue can be in time,
-    the queue goes by the first one that can, and by the earliest deadline that this can meet, so
-    a backlog is worked off.  In a lasting overload (``State.overloaded``) the mean execution times
-    of those before it also count.  Age and place belong to the queue: if an execution is dropped
-    (rule 11, or live a full queue), the queue keeps the place that the dropped one had, or is as
-    late as it.  A preempted execution is checked by itself.  Running executions keep their keys.
-    Only policies whose keys are times demote.  Of undeclared callbacks it is not known how long
-    they take: their queue is late when its first execution is past its deadline, and remains so
-    until it is empty.  So an overload of undeclared callbacks never makes a declared deadline miss
-    for long, and each gets its turn.
-8.  **Ends.** A job ends as exactly one of completed, late, expired, failed, outdated.  It fails
+    its verdict, which is then not in time.  Jobs get no verdicts if they are released less than
+    ``SKIP`` after the first one (warm-up), before ``JUDGE_FROM``, or not before ``JUDGE_UNTIL``.
+    A live run calls ``judge_from`` when all programs have started.
+7.  **Late queues.**  With ``CONTINUE``, late work goes on as before.  With ``DEMOTE``, a queue
+    that comes first is *late* if none of its executions can be in time at any of their sinks: the
+    time plus the mean execution times on the longest path to the sink is past its deadline.  Until
+    one of its executions starts, a late queue counts as released ``LATE_PATIENCE`` relative
+    deadlines later, and so does the job of its first execution at all later vertices.  So late
+    work ages, and each callback gets some time.  As long as another execution in the queue can be
+    in time, the queue has the place of the first such execution, by the earliest deadline that
+    this one can meet.  So a backlog is worked off.  In a lasting overload
+    (``State.overloaded``) the mean execution times of the executions before it count as well.
+    Age and place belong to the queue: if an execution is dropped (rule 11, or live a full queue),
+    the queue keeps the place and the lateness of the dropped execution.  A preempted execution
+    is checked by itself.  Running executions keep their keys.  Only policies whose keys are times
+    demote.
+    It is not known how long undeclared callbacks take.  Their queue is late when its first
+    execution is past its deadline, and remains late until it is empty.  So an overload of
+    undeclared callbacks never makes a declared deadline miss for long, and each of them gets its
+    turn.
+8.  **Ends.**  A job ends as exactly one of completed, late, expired, failed, outdated.  It fails
     when an execution of it fails (its callback raises): each incomplete sink is missed.
-    Executions that have not started when their job expires or fails run (live: each has a message,
-    which is never lost silently), but make no further edge true and are not judged.  Later
-    failures change nothing.  The slot is free when no execution of the job waits, runs or is
-    suspended.
+    Executions that have not started when their job expires or fails still run, because in a live
+    run each of them has a message, which is never lost silently.  But they make no further edge
+    true, and are not judged.  Later failures change nothing.  The slot is free when no execution
+    of the job waits, runs or is suspended.
 9.  **Several processes.**  If the callbacks of a DAG run in several processes (live), each process
     expects some of a job's vertices *here*.  The others count as done: they are not judged here
-    and keep no job open.  A job ends when its sinks here have completed, and the vertices that
-    *lead out*, to a vertex elsewhere: their messages belong to the job until they end.
+    and keep no job open.  A job ends when its sinks here have completed, and also its vertices
+    here that *lead out*, to a vertex elsewhere: their messages belong to the job until they end.
 10. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
     the interpreter (reported by the driver, ``State.x_holds``) starts only if no running execution
     with the same or a smaller priority holds it.  Until then its queue is deferred
     (``State.held_back``), and others overtake it.  If it is more urgent than all holders, it
     starts, unless the driver forbids it for the moment (``State.overtaking``, from
-    ``queues.overtaking_pays``: the wait is short).  Live, those that it overtakes pause, or share
-    the interpreter with it.  An execution that lends its worker, is
-    suspended or turns out to wait (``stop_holding``) holds it no more, and needs it and a worker
-    again when it resumes.
-11. **Only the newest.**  Of a source or sink with ``keep: newest`` at most one execution waits:
-    one that has not started is dropped when that of a later job becomes ready.  So is a release of
-    a timer that is late then (``KEEP_TIMELY``).  A job without its source is
-    ``OUTDATED``; a dropped sink is not in time.
+    ``queues.overtaking_pays``: the wait is short).  In a live run, the overtaken executions pause,
+    or share the interpreter with it.  An execution that lends its worker, is suspended or turns
+    out to wait (``stop_holding``) does not hold the interpreter any more, and needs it and a
+    worker again when it resumes.
+11. **Only the newest.**  A source or sink with ``keep: newest`` has at most one waiting execution:
+    one that has not started is dropped when the execution of a later job becomes ready.  A waiting
+    release of a timer is dropped as well if it is late then (``KEEP_TIMELY``).  A job without its
+    source is ``OUTDATED``; a dropped sink is not in time.
 12. **Importance.**  A vertex has the highest importance of the sinks that it leads to, over
     trigger and queue edges.  While an important sink is late, or the known execution times demand
     more than the workers or the interpreter of a process can give, work of lower importance is
     demoted as if it were late (rule 7), and nothing more.  A sink counts as late for
-    ``LATE_PATIENCE`` of its relative deadlines.  Of too much demand the least importance is
-    demoted, as many levels as necessary, but never the highest.
+    ``LATE_PATIENCE`` of its relative deadlines.  If the demand is too high, the lowest importance
+    is demoted, as many levels as necessary, but never the highest.
 13. **Not due.**  A vertex may publish some of its topics only sometimes.  If it completes without
     one of them, the vertices that the topic leads to, and all after these, are not due in the job
     (``withhold_from``): a sync needs all of its legs.  They get no verdict, and the job does not
-    wait for them.  Until it is known that a sink is due it is not overdue (``is_due``); if its job
-    expires or fails before, it is missed.  Sinks without a deadline are never judged.
+    wait for them.  Until it is known that a sink is due, it is not overdue (``is_due``).  If its
+    job expires or fails before, it is missed.  Sinks without a deadline are never judged.
 14. **Driven syncs.**  Of a sync with ``driven_by`` the message of one topic belongs to a job and
-    starts its vertex; those of the other topics start executions without a job.  Live, the vertex
-    completes with the first execution that *answers* the job: see ``driven``.  In virtual time it
-    completes with its execution, as any other.  An answer also completes the vertex in the older
-    jobs that still await one.  After it these *follow* the answered job: a vertex completes in
-    them when it completes in a later job.  Executions without a job are ordered as if they
-    belonged to the earliest job that they may complete in time (``due_of_answer``).
+    starts its vertex; messages of the other topics start executions without a job.  In a live run,
+    the vertex completes with the first execution that *answers* the job: see ``driven``.  In
+    virtual time it completes with its own execution, as any other vertex.  An answer also
+    completes the vertex in the older jobs that still await one.  After that these jobs *follow*
+    the answered job: a vertex completes in them when it completes in a later job.  Executions
+    without a job are ordered as if they belonged to the earliest job that they may complete in
+    time (``due_of_answer``).
 """
 
 from __future__ import annotations
@@ -514,7 +520,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         s.x_pending[head] = -1
         if s.job_state[slot] == OPEN:
             _complete_vertex(t, s, key, slot, vertex, now)
-    s.job_active[slot] -= 1  # not deactivate(): a call less, too
+    s.job_active[slot] -= 1  # not deactivate(): one call less
     if s.job_active[slot] == 0 and s.job_state[slot] != OPEN:
         free_slot(s, slot)
     return whole

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 
-# States of an execution: it waits in its queue or alone (see ``queues``); a refused one is
-# suspended, too.
+# States of an execution: it waits in its queue or alone (see ``queues``).  A refused execution is
+# suspended.
 IDLE, WAITING, ALONE, RUNNING, SUSPENDED, DONE, DROPPED = range(7)
 
 # Of an execution: whether it has a place in its outer group, or goes on after it has lent that.
@@ -45,9 +45,8 @@ OTHER_KEYS, DEADLINE_KEYS, START_KEYS, DAG_KEYS = range(4)
 # Decisions: (kind, DAG, global vertex, job index, deadline, time).  Each sink of a job is in time,
 # or late: it completed; or missed: it had not completed when the run ended past its deadline; or
 # its job was aborted, expired or failed, or the sink was dropped for a newer job's.  Before that,
-# it may be reported overdue (its deadline is over), or demoted.  It is in time after it was
-# overdue if it completed just before the deadline, and that was known only after it.  A sink that
-# is not due in a job has no other verdict about it.  The
+# it may be reported overdue (its deadline is over; it is not in time then), or demoted.  A sink
+# that is not due in a job has no other verdict about it.  The
 # deadline is that of the sink; DROP has the execution there, the end of a job its outcome.  The
 # time is that of the decision (for a completed sink the completion), or -1 for sinks whose jobs
 # ended otherwise.  The end of a job has -1, or NOT_JUDGED, instead of a vertex.

@@ -29,7 +29,7 @@ least difference of these sinks' deadlines and the longest paths to them (least 
 (``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
 execution time, ``height`` the number of edges on the longest path to a sink.
 * ``importance``: the highest of the sinks that it leads to, over trigger and queue edges.
-``tolerated``, ``tolerated_of``: of a sink with ``tolerate: m of k``, else 0.
+* ``tolerated``, ``tolerated_of``: the m and k of a sink with ``tolerate: m of k``, else 0.
 
 ``is_optional``, next to ``successors``: 1 if the edge becomes true only in some jobs, because its
 topic is one that the vertex may publish.  ``gates``, from ``first_gate`` of a sink on: the

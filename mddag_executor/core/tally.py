@@ -296,7 +296,7 @@ class Tally:
                 'deadline_ns': deadline, 'completed_ns': completed}
 
     def _first_of_all(self) -> FirstMiss | None:
-        """Return the miss of the earliest deadline, also of overdue sinks without verdict yet."""
+        """Return the miss of the earliest deadline; overdue sinks without a verdict count."""
         first = self.first_miss
         for (vertex, job), deadline in self.overdue.items():
             if first is None or deadline < first['deadline_ns']:

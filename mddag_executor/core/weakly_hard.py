@@ -48,7 +48,7 @@ class MissWindow:
             del jobs[:bisect_left(jobs, jobs[-1] - 2 * self.of - self.ORDER)]
 
     def worst_with(self, jobs: Iterable[int]) -> int:
-        """Return ``worst`` as if these jobs had missed, too."""
+        """Return ``worst`` as if these jobs had missed as well."""
         other = MissWindow(self.of)
         other.worst, other._jobs = self.worst, list(self._jobs)
         for job in jobs:

@@ -26,7 +26,7 @@ Its reading of the documents:
   the deadlines that this one can meet (``rad``, ``llf``). If the mean times of all vertices
   together need more than the workers, the executions before it in the queue take their time as
   well.  If no execution can be in time, the queue is ordered as if the job of its head were
-  released ten relative deadlines later, until one of its executions runs; so are the later
+  released eight relative deadlines later, until one of its executions runs; so are the later
   vertices of that job.  A preempted execution is a queue by itself.
 * ``keep: newest`` at a source or sink: of two executions in a queue, the one of the earlier job is
   dropped.  With ``demote``, an execution of a timer that can make none of the deadlines that it
@@ -238,13 +238,13 @@ class BruteForce:
         return {sink for sink, start in self._starts(execution).items() if begin > start}
 
     def _late_priority(self, execution, in_queue):
-        """Return the priority ten deadlines after the execution, or its queue, was late first."""
+        """Return the priority eight deadlines after the execution or its queue was late first."""
         job, key = execution.job, self._at(execution)
         since = [each for each in (job.demoted, self.demoted.get(key) if in_queue else None)
                  if each is not None]
         if not since:
             deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
-            since = [self.now * self.tick + 10 * deadline]
+            since = [self.now * self.tick + 8 * deadline]
         if job.demoted is None:
             job.demoted = min(since)
         if in_queue:
