@@ -333,12 +333,12 @@ def _parts(done: Table, chain: _Chain) -> tuple[Mask, Table]:
     waiting, executing, suspended, group = np.where(chain.known, chain.until(completed), 0)
     first = np.where(chain.known, chain.first, completed)
     lag = np.where(chain.known & chain.is_whole, first - release, 0)
-    return chain.known, rows(
-        RESPONSE_PARTS, len(done), dag=done['dag'], sink=done['sink'], job=done['job'],
-        release=release, completed=completed, release_lag=lag, waiting=waiting,
-        executing=executing, suspended=suspended,
-        transport=completed - first - waiting - executing - suspended,
-        unknown=first - release - lag, waiting_group=group)
+    return chain.known, Table({
+        'dag': done['dag'], 'sink': done['sink'], 'job': done['job'], 'release': release,
+        'completed': completed, 'release_lag': lag, 'waiting': waiting, 'executing': executing,
+        'suspended': suspended,
+        'transport': completed - first - waiting - executing - suspended,
+        'unknown': first - release - lag, 'waiting_group': group})
 
 
 def _published(several: Sequence[_Chain], leg: Ints, ready: Ints) -> tuple[Ints, _Chain]:

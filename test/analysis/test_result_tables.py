@@ -151,6 +151,13 @@ def test_columns_have_units_and_unknown_values_are_null(outcome):
         numbers['completed'] < 0).tolist()
 
 
+def test_arrow_tables_have_the_same_memory():
+    outcome = of_demo(None)
+    for name, column in (('executions', 'start'), ('verdicts', 'deadline')):
+        values = outcome.table(name)[column]
+        assert outcome.to_arrow(name)[column].chunk(0).buffers()[1].address == values.ctypes.data
+
+
 def test_a_table_that_does_not_exist():
     with pytest.raises(KeyError, match=r"no table 'verdict': the tables are behind, causes, "):
         of_demo(None).table('verdict')
