@@ -510,7 +510,7 @@ class WorkerPool:
             if events is None:
                 self._has_called = False
                 self.due.has_looked(now - self.offset)
-                self._look(now)
+                self._look()
             else:
                 self._bell_rings = False  # the waiting thread may have received it
                 self._collect(events, since)
@@ -537,11 +537,15 @@ class WorkerPool:
         if self.running and self.due.is_due(self.now - self.offset):
             self.due.handle(self.now, since)
 
-    def _look(self, now: int) -> None:
+    def _look(self) -> None:
         """Collect what has come while no thread waited for it; the caller holds the lock."""
         if self.running and not self.polling:
-            self._polled_at = now
-            self._collect(self.loop.poll(), now)
+            # The poll takes the bell's event, and that of the timerfd if it has just expired:
+            # no thread gets these any more, so the flag and the time must be those after it.
+            events = self.loop.poll()
+            self._bell_rings = False
+            now = self._polled_at = self.tick()
+            self._collect(events, now)
             if self.engine.interpreter.is_wanted():
                 self.due.check.begin_late(now - self.offset)
 
@@ -568,7 +572,7 @@ class WorkerPool:
                 if work.entity.removed:
                     self.wake_executor()  # the registry can forget it now
                 if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:
-                    self._look(now)
+                    self._look()
             if is_last:
                 self.due.arm(now - self.offset)
                 if self._verdicts.missed != self._misses:

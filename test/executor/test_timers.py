@@ -112,6 +112,37 @@ def test_after_a_short_callback_that_is_rare_no_thread_looks(
         assert wait_for(lambda: pool.polling and pool.parking.watch.at == NEVER)
 
 
+def test_a_timer_that_becomes_due_while_a_busy_thread_looks_runs(make_executor, make_node):
+    """The thread takes the event of the timerfd, so it has to know the time after that."""
+    node, ran, ticks, delays = make_node(), [], [], []
+    executor = make_executor(nodes=[node])
+    loop = executor._pool.loop
+    poll, timer = loop.poll, loop.timer
+
+    def compute():
+        while time.monotonic_ns() < timer.at - 3_000_000 < NEVER // 2:
+            pass
+        ran.append(1)
+
+    def poll_late():
+        due = timer.at
+        if ran and not delays and due - time.monotonic_ns() < 50_000_000:
+            delays.append(max(0, due + 1_000_000 - time.monotonic_ns()) / 1e9)
+            time.sleep(delays[0])
+        return poll()
+
+    loop.poll = poll_late
+    guard = node.create_guard_condition(compute)
+    node.create_timer(0.1, lambda: ticks.append(1))
+    with Spinning(executor):
+        assert wait_for(lambda: len(ticks) == 2)
+        time.sleep(max(0, timer.at - 10_000_000 - time.monotonic_ns()) / 1e9 % 0.1)
+        guard.trigger()
+        assert wait_for(lambda: ran)
+        before = len(ticks)
+        assert wait_for(lambda: len(ticks) > before + 3)
+
+
 def test_a_timer_that_was_cancelled_runs_when_it_is_reset(make_executor, make_node, spinning):
     node, ran = make_node(), []
     timer = node.create_timer(0.01, lambda: ran.append(1), autostart=False)

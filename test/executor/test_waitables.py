@@ -4,6 +4,7 @@
 
 import os
 import threading
+import time
 
 from mddag_executor.executor import compat
 from mddag_executor.executor.listeners import ListenerError
@@ -208,6 +209,28 @@ def test_what_is_triggered_runs(make_executor, make_node, spinning, monkeypatch,
         node.destroy_guard_condition(other)
         both_run(False)
     assert ('mddag-wait-set' in seen.asked_by) is not listens
+
+
+def test_a_wake_up_that_a_busy_thread_has_received_is_not_waited_for(make_executor, make_node):
+    """A thread that looks for events after a callback also takes the event of the bell."""
+    node, ran = make_node(), []
+
+    def compute():  # too long for the thread to go on without looking
+        end = time.monotonic() + 0.002
+        while time.monotonic() < end:
+            pass
+        ran.append(1)
+
+    guards = [node.create_guard_condition(compute) for _ in range(2)]
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        for _ in range(5):
+            before = len(ran)
+            for guard in guards:
+                guard.trigger()
+            assert wait_for(lambda: len(ran) > before)
+            assert wait_for(lambda: is_idle(executor))
+            assert wait_for(executor.create_task(lambda: None).done)
 
 
 class Bare(Waitable):
