@@ -228,7 +228,7 @@ def test_a_wake_up_that_a_busy_thread_has_received_is_not_waited_for(make_execut
             before = len(ran)
             for guard in guards:
                 guard.trigger()
-            assert wait_for(lambda: len(ran) > before)
+            assert wait_for(lambda before=before: len(ran) > before)
             assert wait_for(lambda: is_idle(executor))
             assert wait_for(executor.create_task(lambda: None).done)
 
