@@ -179,6 +179,17 @@ class DueTimes:
             if first != self._timer.at:
                 self._timer.arm(first)
 
+    def arm_for_new(self, now: int) -> None:
+        """
+        Let a thread wake up for new appointments and entities as well.
+
+        The caller starts nothing, so the time of a look that was set before stays.
+        """
+        if self._pool.polling or self._pool.is_stepping:
+            self.arm_by(self._agenda.first())
+        elif self._pool.running and self._pool.engine.is_busy:
+            self.arm_by(self._next_look(now))
+
     def rest(self, now: int) -> None:
         """Set the time for a thread that has nothing to run."""
         if self._interpreter.holders or not self._pool.polling or not self._pool.running:
@@ -217,9 +228,12 @@ class DueTimes:
     def look(self, now: int) -> None:
         """Set the time of the next look while callbacks run and no thread waits for events."""
         self.check.note(now)
-        at = min(self._agenda.first_latest(), now + self._allowance)
+        at = self._next_look(now)
         if at != self._watch.at:
             self._watch.arm(at)
+
+    def _next_look(self, now: int) -> int:
+        return min(self._agenda.first_latest(), now + self._allowance)
 
     def look_after(self, now: int, patience: int) -> None:
         """

@@ -109,9 +109,11 @@ def clear_listener(kind: str, address: int, fd: int) -> None:
         _SET[kind](address, None, None)
         return
     with _guards_lock:
-        rest = tuple(each for each in _GUARDS.pop(address, ()) if each != fd)
+        rest = tuple(each for each in _GUARDS.get(address, ()) if each != fd)
         if rest:
-            _GUARDS[address] = rest
+            _GUARDS[address] = rest  # at once: a trigger may read it at any time
+        else:
+            _GUARDS.pop(address, None)
 
 
 def announce_trigger(address: int) -> None:

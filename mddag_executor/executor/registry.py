@@ -90,10 +90,11 @@ def _listed(node: Node, name: str) -> list[Any]:
 
 
 class Changes(NamedTuple):
-    """The entities that have appeared, and those that have disappeared."""
+    """The entities that have appeared, disappeared, and moved to another outer group."""
 
     added: list[Kind]
     gone: list[Kind]
+    moved: list[Kind]
 
 
 class Registry:
@@ -138,6 +139,7 @@ class Registry:
         """
         present: dict[int, Kind] = {}
         new: list[tuple[str, Any, str, int]] = []
+        moved: list[Kind] = []
         for node, lists in found.items():
             try:
                 name = self._name(node)
@@ -152,7 +154,9 @@ class Registry:
                         new.append((list_name, rclpy_object, name, outer))
                     else:
                         present[id(rclpy_object)] = entity
-                        self._change(entity, outer)
+                        if entity.outer != outer:
+                            self._engine.move(entity, outer)
+                            moved.append(entity)
         gone = [each for key, each in self.by_id.items() if key not in present]
         for each in gone:  # first: a new one may be their callback's next entity
             self.bindings.unbind(each)
@@ -172,7 +176,7 @@ class Registry:
             engine.remove(each, now)
         if self._recorder is not None:
             self._recorder.entities(found, added)
-        return Changes(added, gone)
+        return Changes(added, gone, moved)
 
     def _appear(
         self, list_name: str, rclpy_object: Any, node: str, outer: int, now: int
@@ -190,10 +194,6 @@ class Registry:
         self._groups.enter(entity)
         self.bindings.bind(entity)
         return entity
-
-    def _change(self, entity: Kind, outer: int) -> None:
-        if entity.outer != outer:
-            self._engine.move(entity, outer)
 
     def _name(self, node: Any) -> str:
         """Return a node's name, even if it has been destroyed but not removed."""

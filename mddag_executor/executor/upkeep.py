@@ -102,7 +102,7 @@ class Upkeep:
         self._living = [weakref.ref(node) for node in nodes]
         found = snapshot(nodes)
         with pool.lock:
-            added, gone = registry.refresh(found, pool.tick())
+            added, gone, moved = registry.refresh(found, pool.tick())
         back = [each for each in self._silent if not each.removed]
         self._silent = []
         for entity in gone:
@@ -111,7 +111,9 @@ class Upkeep:
             self._listen(entity)
         self._apply()
         with pool.lock:
-            pool.due.arm(time.monotonic_ns())
+            pool.due.arm_for_new(time.monotonic_ns())
+            if moved:
+                pool.wake_for_more()  # its new outer group may be open
 
     def _publishers(self, subscription: Any) -> frozenset[bytes] | None:
         """Return the ids of the publishers of a subscription, None if they are unknown."""

@@ -205,7 +205,7 @@ class Rerun:
     def _refresh(self) -> None:
         nodes = self._holder.ordered_nodes()
         registry, engine, now = self._registry, self._engine, self._loop.now
-        added, _ = registry.refresh(snapshot(nodes), now)
+        added = registry.refresh(snapshot(nodes), now).added
         self._hosted |= registry.hosted()
         for entity in added:
             if entity.rclpy_object in self._triggered:

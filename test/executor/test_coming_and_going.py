@@ -14,10 +14,12 @@ import weakref
 
 from mddag_executor.executor import publishing, waitables
 from msg_graph import loads
+import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -127,6 +129,47 @@ GRAPH = graph(
 CYCLES = 15
 # What is kept of the last ones: publications and response times, a few in a worker's frame.
 SETTLED = 5
+
+
+@pytest.mark.parametrize('to_group', [False, True])
+def test_an_execution_that_waits_runs_when_its_node_moves_to_an_open_group(
+        make_executor, make_node, to_group):
+    node, ran = make_node(), []
+    guard = node.create_guard_condition(lambda: ran.append(1))
+    executor = make_executor(nodes=[node])
+    closed, opened = executor.new_outer_group(), executor.new_outer_group()
+    opened.open(1)
+    executor.put(node, closed)
+    with Spinning(executor):
+        guard.trigger()
+        assert wait_for(lambda: executor.statistics()['queue'] == 1)
+        executor.put(node, opened if to_group else None)
+        assert wait_for(lambda: ran)
+
+
+def test_a_refresh_does_not_put_off_the_look_at_a_callback_that_takes_longer_than_usual(
+        make_executor, make_node):
+    """Another thread soon runs what the callback has posted: it may wait for that."""
+    node = make_node(parameter_overrides=[  # nothing comes from outside, so no other look is due
+        Parameter('start_type_description_service', value=False)])
+    victims = [node.create_guard_condition(nothing) for _ in range(3)]
+    ran, waited = [], []
+
+    def callback():
+        if len(ran) % 20 == 19:
+            is_done = threading.Event()
+            executor.create_task(is_done.set)
+            node.destroy_guard_condition(victims.pop())
+            waited.append(is_done.wait(15.0))
+        ran.append(1)
+
+    guard = node.create_guard_condition(callback)
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        for count in range(1, 61):
+            guard.trigger()
+            assert wait_for(lambda count=count: len(ran) == count, 30.0)
+    assert waited == [True] * 3
 
 
 class Brief:
