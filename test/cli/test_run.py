@@ -384,7 +384,7 @@ def test_a_node_may_remove_the_folder_in_which_the_run_began(folder, mddag):
     done = mddag('run', '--node', 'bad:leave', '--duration', '100ms', '--trace', '../out.mcap',
                  cwd='start')
     assert done.returncode == 0, done.stderr
-    assert 'graph from-trace ../out.mcap ' in done.stdout
+    assert 'there is nothing to judge' in done.stdout
     assert sorted(os.listdir()) == ['other', 'out.mcap'] and os.listdir('other') == ['deep']
 
 
