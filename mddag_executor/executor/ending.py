@@ -95,7 +95,8 @@ class Ending:
         """Close the descriptors, once the run has ended and no thread uses them."""
         with self._lock:
             if self._has_ended and self.is_asked:
-                self._close_descriptors()
+                with self._pool.lock:  # another thread may be in ``WorkerPool.pause``
+                    self._close_descriptors()
 
     def _close_descriptors(self) -> None:
         if self.stepping is not None:

@@ -181,14 +181,16 @@ class EventLoop:
         announce(self._bell)
 
     def wake_all(self) -> None:
-        """Wake all waiting threads, and let no thread wait until ``let_wait``."""
-        announce(self._leave)
-        self._epoll.register(self._leave, select.EPOLLIN)
+        """Wake all waiting threads, and let no thread wait until ``let_wait``, unless closed."""
+        if self._leave >= 0:
+            announce(self._leave)
+            self._epoll.register(self._leave, select.EPOLLIN)
 
     def let_wait(self) -> None:
-        """End ``wake_all``: threads may wait again."""
-        self._epoll.unregister(self._leave)
-        take_count(self._leave)
+        """End ``wake_all``: threads may wait again, unless the loop was closed meanwhile."""
+        if self._leave >= 0:
+            self._epoll.unregister(self._leave)
+            take_count(self._leave)
 
     def close(self) -> None:
         """
