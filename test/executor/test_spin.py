@@ -456,6 +456,7 @@ def end_with_it(parts, send=None):
 
 
 PUBLISHES = """
+from collections import Counter
 import signal, sys, threading, time
 import rclpy
 from std_msgs.msg import String
@@ -465,8 +466,9 @@ from msg_graph import loads
 rclpy.init()
 node = rclpy.create_node('node')
 publisher = node.create_publisher(String, '/command', 10)
-heard = []
-node.create_subscription(String, '/command', lambda message: heard.append(message.data), 10000)
+heard = Counter()
+node.create_subscription(
+    String, '/command', lambda message: heard.update([message.data]), 10000)
 timer = node.create_timer(0.001, lambda: publisher.publish(String(data='job')))
 executor = MultiDeadlineExecutor(loads(sys.argv[2]))
 executor.add_node(node)
@@ -484,7 +486,7 @@ signal.setitimer(signal.ITIMER_REAL, 0.001)
 
 
 def done():
-    return stops == 200 and heard.count('stop') >= 200
+    return stops == 200 and heard['stop'] >= 200
 
 if sys.argv[1] == 'spin':
     future = rclpy.Future()
@@ -503,7 +505,7 @@ else:
         executor.create_task(lambda: None)
     executor.shutdown()
     thread.join()
-print(stops, heard.count('stop'))
+print(stops, heard['stop'])
 """
 
 

@@ -162,7 +162,7 @@ from mddag_executor.simulate import compiled
 if sys.argv[1:]:
     compiled._hash_of_sources = lambda: sys.argv[1]
 entry = compiled.entry_points()['free_run']
-memory = [compiled.Memory(*[0] * 99) for _ in range(5)]
+memory = [compiled.Memory(*[0] * 99) for _ in range(4)]
 entry(*(each.address for each in memory))
 print(sum(entry.stats.cache_hits.values()), sum(entry.stats.cache_misses.values()))
 """

@@ -203,7 +203,7 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('nobody_looks', [(
         'executor/workers.py', """\
 self.due.has_looked(now - self.offset)
-                self._look(now)""", 'self.due.has_looked(now - self.offset)')], of(
+                self._look()""", 'self.due.has_looked(now - self.offset)')], of(
         'test_gil.py',
         'test_arrivals_with_an_earlier_deadline_overtake_and_others_wait[elsewhere]')),
     Case('add_node_does_not_wake', [(
