@@ -1,7 +1,10 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-The scheduling rules, all of them and only here (those about whole jobs are in ``jobs``).
+The scheduling rules: all of them are listed here.
+
+Their code is here, in ``jobs`` (whole jobs), ``queues`` (order, groups, the interpreter),
+``overload`` (late queues), ``driven`` (syncs of two rates) and ``simulate.dispatch`` (preemption).
 
 Theory of operation
 -------------------

@@ -14,9 +14,10 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     none.  Messages of known publications go to the job of these (``attribution``), others may
     enter from another process (``other_processes``), and all others run as undeclared.
 2.  *Queue depth.*  A queue retains as many messages as its QoS allows; beyond that the oldest are
-    dropped and counted, and with ``DEMOTE`` late ones of jobs after it: a queue that stays full
-    would make every message wait for as many periods.  The place of a dropped message is its
-    queue's (``core.queues``), so a queue that overflows permanently gets its turn.
+    dropped and counted.  With ``DEMOTE``, late messages after it are dropped as well: otherwise
+    each message in a queue that stays full would wait for as many periods as the queue is deep.
+    The queue keeps the place of a dropped message (``core.queues``), so a queue that overflows
+    permanently gets its turn.
     Messages of the other topics of a driven sync belong to no job.  The execution that they start
     may complete the vertex of one (``core.driven``): ``Work.answers``.
 3.  *The core decides* what to run, and handles the ends of executions (``finished``,
@@ -176,7 +177,7 @@ class Engine:
         self._is_bypassed = self._may_bypass = False
         self._bypassing: Work | None = None
         self._bypassing_since = 0
-        self._lane: deque[Work] = deque()
+        self._bypass_queue: deque[Work] = deque()
         self._last_id = -1
         self._complete = self.scheduler.complete
         self._take = self.scheduler.take
@@ -196,7 +197,7 @@ class Engine:
         self.notes_publications = record is not None or self.path_watch is not None
         self._default_deadline = default_deadline
 
-    # --- ready work --- --------------------------------------------------------------------------
+    # --- ready work ------------------------------------------------------------------------------
 
     def taken(
         self, entity: Entity, message: Any, source_timestamp: int, number: int | None, now: int
@@ -230,7 +231,11 @@ class Engine:
             self.ready(work, now)
 
     def _is_over(self, dag: int) -> bool:
-        """Return whether a timer that fires once has: its callback, which cancels it, is late."""
+        """
+        Return whether a one-shot timer has released its job already.
+
+        It fires again if the callback that cancels it has not run yet.
+        """
         return self.tables.period[dag] == NEVER and self._next_job[dag] > 0
 
     def timer_missed(self, entity: Entity, due: int, period: int, count: int, now: int) -> None:
@@ -292,15 +297,15 @@ class Engine:
         work.ready_ns = now
         waiting = entity.waiting
         if entity.may_answer or 0 < entity.depth <= len(waiting):
-            self._core()
+            self._end_bypass()
         elif not self._is_bypassed:
             self._is_bypassed = self._may_bypass and self._is_core_empty()
         if self._is_bypassed and entity.outer >= 0 and not self._is_outer_open(entity.outer):
-            self._core()
+            self._end_bypass()
         if self._is_bypassed:
             x = work.x = self._last_id = self._last_id - 1
             waiting[x] = None
-            self._lane.append(work)
+            self._bypass_queue.append(work)
             entity.ready += 1
             return
         self._enqueue(work)
@@ -349,16 +354,16 @@ class Engine:
         return not (has_waiting(self._state) or state.scalars[N_IDLE] < self.n_workers
                     or max(state.group_owner, default=-1) >= 0)
 
-    def _core(self) -> Scheduler:
-        """Return the core, after the end of the bypass: everything is reported to it."""
+    def _end_bypass(self) -> Scheduler:
+        """End the bypass: report everything to the core; return the core."""
         if self._is_bypassed:
             self._is_bypassed = False
             work, self._bypassing = self._bypassing, None
             if work is not None:
                 self._enqueue(work)
                 self._start_next(work.worker, self._bypassing_since)
-            lane, self._lane = self._lane, deque()
-            for work in lane:
+            bypassing, self._bypass_queue = self._bypass_queue, deque()
+            for work in bypassing:
                 del work.entity.waiting[work.x]
                 self._enqueue(work)
         return self.scheduler
@@ -449,7 +454,7 @@ class Engine:
         state.x_group[x] = entity.group
         state.x_outer[x] = entity.outer
         state.x_holds[x] = entity.habit.holds
-        self._core().ready(x, now)
+        self._end_bypass().ready(x, now)
         work.x = x
         work.ready_ns = now
         entity.ready += 1
@@ -458,7 +463,7 @@ class Engine:
         if state.decisions:
             self._decided(now)  # it replaced an older one, which was dropped
 
-    # --- dropped work --- ------------------------------------------------------------------------
+    # --- dropped work ----------------------------------------------------------------------------
 
     def _drop(self, entity: Entity, x: int, reason: str, now: int) -> None:
         del entity.waiting[x]
@@ -470,7 +475,7 @@ class Engine:
 
     def _drop_oldest(self, entity: Entity, now: int) -> None:
         """Drop the oldest message of a queue with one too many, and late ones after it."""
-        self._core()
+        self._end_bypass()
         waiting = entity.waiting
         self._drop(entity, next(iter(waiting)), 'qos_depth', now)
         while len(waiting) > 1:
@@ -482,19 +487,19 @@ class Engine:
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a destroyed entity: its waiting executions never run."""
         entity.removed = entity.may_be_gone = True
-        self._core()
+        self._end_bypass()
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
         if entity.queue >= 0:
             self.scheduler.free_queue(entity.queue)
             entity.queue = -1
 
-    # --- dispatch --- ----------------------------------------------------------------------------
+    # --- dispatch --------------------------------------------------------------------------------
 
     @property
     def queue_length(self) -> int:
         """Return the number of executions that wait, for a worker or for their group."""
-        return len(self._lane) + self.scheduler.queue_length
+        return len(self._bypass_queue) + self.scheduler.queue_length
 
     @property
     def idle_workers(self) -> int:
@@ -509,7 +514,7 @@ class Engine:
     @property
     def has_waiting(self) -> bool:
         """Return whether any execution waits, except for its callback group."""
-        return bool(self._lane) or has_waiting(self._state)
+        return bool(self._bypass_queue) or has_waiting(self._state)
 
     def step(self, worker: int, now: int, others_wait: bool = True) -> Step:
         """
@@ -521,9 +526,9 @@ class Engine:
         step, state, holders = self._step, self._state, self._holders
         step.overtaken = None
         step.deadline = self.deadlines.next
-        if self._lane or state.ready or state.held_back:
+        if self._bypass_queue or state.ready or state.held_back:
             work = step.work = self._dispatch(worker, now)
-            waits = bool(self._lane or state.ready or state.held_back)
+            waits = bool(self._bypass_queue or state.ready or state.held_back)
         else:
             work = step.work = None
             waits = False
@@ -574,18 +579,18 @@ class Engine:
     def _dispatch(self, worker: int, now: int) -> Work | None:
         work = None
         if self._is_bypassed:
-            if not self._lane:
+            if not self._bypass_queue:
                 return None
-            entity = self._lane[0].entity
+            entity = self._bypass_queue[0].entity
             if (self._bypassing is None and entity.wall_ns <= SHORT_CALLBACK_NS
                     and entity.gate is None):
-                work = self._bypassing = self._lane.popleft()
+                work = self._bypassing = self._bypass_queue.popleft()
                 self._bypassing_since = now
                 del entity.waiting[work.x]
                 work.x = -1
                 work.worker = worker
             else:
-                self._core()
+                self._end_bypass()
         if work is None:
             state = self._state
             if not (state.ready or state.held_back):
@@ -690,9 +695,9 @@ class Engine:
 
     def _may_start_more(self, now: int) -> bool:
         if self._is_bypassed:
-            if self._bypassing is None or not self._lane:
-                return bool(self._lane)
-            self._core()
+            if self._bypassing is None or not self._bypass_queue:
+                return bool(self._bypass_queue)
+            self._end_bypass()
         return self.interpreter.may_start_more(now)
 
     # --- executions that run ---------------------------------------------------------------------
@@ -708,7 +713,7 @@ class Engine:
 
     def lend(self, work: Work) -> None:
         """Free the worker of an execution that continues without one."""
-        core = self._core()
+        core = self._end_bypass()
         self._let_go(work)
         core.lend(work.x)
 
@@ -719,7 +724,7 @@ class Engine:
 
     def _resume(self, work: Work, now: int) -> None:
         entity = work.entity
-        self._core().resume(work.x, entity.ready, entity.habit.holds, now)
+        self._end_bypass().resume(work.x, entity.ready, entity.habit.holds, now)
 
     def waits_for_place(self, work: Work) -> bool:
         """Return whether an execution that is to go on waits for others of its outer group."""
@@ -734,13 +739,13 @@ class Engine:
         entity = work.entity
         is_first = not self.has_waiting
         self._work[work.x] = work
-        self._core().rejoin(work.x, entity.ready, entity.habit.holds, now)
+        self._end_bypass().rejoin(work.x, entity.ready, entity.habit.holds, now)
         return is_first
 
     def go_on_without(self, work: Work) -> None:
         """Let an execution go on that waits for a worker after ``rejoin``, without one."""
         del self._work[work.x]
-        self._core().go_on_without(work.x)
+        self._end_bypass().go_on_without(work.x)
 
     def begun(self) -> list[Work]:
         """Return the coroutines that have begun, and are suspended or wait to go on."""
@@ -759,7 +764,7 @@ class Engine:
             if x >= 0 and self._state.x_state[x] == SUSPENDED:
                 self.scheduler.ask_again(x)
 
-    # --- outer groups --- ------------------------------------------------------------------------
+    # --- outer groups ----------------------------------------------------------------------------
 
     def new_outer_group(self) -> int:
         """Add an outer group of callbacks (see ``core.rules``, rule 4); it is closed."""
@@ -776,7 +781,7 @@ class Engine:
         :param once: it closes when the next one starts.
         :return: whether one may start now.
         """
-        core, state = self._core(), self._state
+        core, state = self._end_bypass(), self._state
         core.open_outer(outer, limit, once)
         return any(
             state.x_outer[first_of(state, entry)] == outer and has_place(
@@ -795,13 +800,13 @@ class Engine:
 
     def move(self, entity: Entity, outer: int) -> None:
         """Move an entity to another outer group, or to none (-1)."""
-        core = self._core()
+        core = self._end_bypass()
         entity.outer = outer
         for work in self._work.values():
             if work.entity is entity:
                 core.set_outer(work.x, outer)
 
-    # --- ends of executions --- ------------------------------------------------------------------
+    # --- ends of executions ----------------------------------------------------------------------
 
     def finished(
         self, work: Work, start: int, end: int, now: int, vtid: int, worker: int,
@@ -842,7 +847,7 @@ class Engine:
     def _finished_watched(
         self, work: Work, start: int, end: int, now: int, vtid: int, worker: int, failed: bool
     ) -> None:
-        """End an execution that failed, may answer, or is recorded or watched; see there."""
+        """End an execution that failed, may answer, or is recorded or watched (``finished``)."""
         entity = work.entity
         x, work.x = work.x, -1
         origin, records = work.origin, self._records
@@ -925,7 +930,7 @@ class Engine:
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:
         """Take a running execution off its worker until ``resume``."""
-        self._core()
+        self._end_bypass()
         work.entity.busy_ns += end - start
         if self._records is not None:
             self._records.run(work, start, end, vtid, worker, goes_on=True)
@@ -939,7 +944,7 @@ class Engine:
 
     def refused(self, work: Work, now: int) -> None:
         """Put an execution back that its callback group has refused (see ``work``)."""
-        self._core()
+        self._end_bypass()
         entity, x = work.entity, work.x
         if entity.removed:
             self.destroyed(work, now)
@@ -973,7 +978,7 @@ class Engine:
 
     def destroyed(self, work: Work, now: int) -> None:
         """End a dispatched execution that must not run: its job cannot complete any more."""
-        self._core()
+        self._end_bypass()
         x, work.x = work.x, -1
         self._let_go(work)
         if work.origin is not None:
@@ -1069,10 +1074,10 @@ class Engine:
                 yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
             elif (x in work.entity.waiting) != (state.x_started[x] < 0):
                 yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
-        if (self._is_bypassed or self._lane or self._bypassing) and not (
+        if (self._is_bypassed or self._bypass_queue or self._bypassing) and not (
                 self._is_bypassed and self._is_core_empty()):
             yield 'executions bypass the core, which has others'
-        known = {**self._work, **{work.x: work for work in self._lane}}
+        known = {**self._work, **{work.x: work for work in self._bypass_queue}}
         for entity in {work.entity for work in known.values()}:
             if any(x not in known or known[x].entity is not entity for x in entity.waiting):
                 yield f'{[*entity.waiting]} are not all executions of one entity that wait'

@@ -122,8 +122,8 @@ class Registry:
         self.by_id: dict[int, Kind] = {}
         self.own: set[Any] = set()
         self.outer_groups: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
-        # destroyed entities with unfinished executions, and the counts of earlier ones
         self._counting = threading.Lock()
+        # destroyed entities with unfinished executions, and the counts of earlier ones
         self._retired: list[Kind] = []
         self._past: dict[str, dict[str, Any]] = {}
         self._names: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()

@@ -46,7 +46,7 @@ class ThreadState(Enum):
     PARKED = 'parked'       # waits to be called, or for the time of a look
     WAITING = 'waiting'     # waits for events
     RUNNING = 'running'     # runs a callback
-    OUT = 'out'             # runs one that has lent its worker, and waits or waits for its turn
+    OUT = 'out'             # its callback has lent its worker: waits for the answer, then for one
 
 
 for _state, _next in (
@@ -99,8 +99,9 @@ class WorkerThread:
     :ivar worker: the number of its last worker in the core.
     :ivar state: what it does; only the pool changes it.
     :ivar permit: a lock, released to let its callback go on.
-    :ivar has_lent: whether its callback has returned its worker at any time; ``is_out``: whether
-        it has none now; ``waits``: whether it still waits for what it lent its worker for.
+    :ivar has_lent: whether its callback has lent its worker at any time.
+    :ivar is_out: whether its callback has no worker now.
+    :ivar waits: whether it still waits for the answer for which it lent its worker.
     :ivar measurement: of its running callback; None: it is not measured.
     :ivar paused_ns: for how long the running callback has paused.
     :ivar pause: the pause of the callback that it has just overtaken.
@@ -213,7 +214,7 @@ class WorkerThread:
         wall = end - start - self.paused_ns
         if (measurement is None and not self.published
                 and entity.wall_ns <= SHORT_CALLBACK_NS >= wall):
-            habit.rests -= 1  # an average of short executions stays short without it
+            habit.rests -= 1  # an average of short executions stays short without a measurement
         else:
             self._note_times(work, measurement, wall)
         if pool.callback_ended is not None and not isinstance(self.outcome, BaseException):

@@ -22,12 +22,12 @@ Theory of operation
 4.  *Waking others.*  If more than one execution may start, one thread is called, which does the
     same.  No thread is called while a *short* callback runs, because its thread will be free in
     time.  A callback is short if it usually ends within ``SHORT_CALLBACK_NS`` of its start or of a
-    publication that it has made.  If it runs longer, a parked thread looks.
-5.  *Time* is in ``due``.
+    publication that it has made.  If it runs longer, a parked thread looks for events.
+5.  *Time.*  ``due`` sets the two timers: for a thread that waits for events, and for a parked one.
 6.  *Lending.*  A callback that waits inside ``Client.call`` has no worker meanwhile
     (``lending``).
 7.  *Coroutines.*  A coroutine that waits for a future is suspended.  It keeps its callback group
-    but no worker.  When the future is done, the coroutine also becomes ready again.
+    but no worker.  When the future is done, the coroutine becomes ready again.
 8.  *Errors.*  An exception of a callback or of a thread of the pool goes to ``fail`` and ends the
     spin.
 """
@@ -250,7 +250,7 @@ class WorkerPool:
             step = self.engine.look(self.now, asks=False)
             if step.n_idle:
                 rest = step.patience_ns
-                # if something computes, it is not known yet whether it does
+                # it is not known yet whether the holder really computes: half the time
                 self.due.arm_by(
                     monotonic_ns() + (rest // 2 if step.holder is not None else rest))
         else:
@@ -398,7 +398,7 @@ class WorkerPool:
         return True
 
     def need_threads(self, n_out: int) -> None:
-        """Make a thread if, without so many, there are fewer threads than workers."""
+        """Make a thread if fewer than ``n_workers`` remain when ``n_out`` have no worker."""
         if len(self._threads) - n_out < self.engine.n_workers:
             self._new_thread()
 

@@ -143,7 +143,11 @@ class Recording:
 
     @property
     def unjudged(self) -> dict[int, int] | None:
-        """Return by DAG the number of withdrawn jobs; None: none can be."""
+        """
+        Return by DAG the number of withdrawn jobs.
+
+        None: the run has no links, so that no job can be withdrawn.
+        """
         if not self.run.links:
             return None
         ends, released = self.job_ends, self.releases['release']

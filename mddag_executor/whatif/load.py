@@ -7,10 +7,11 @@ Theory of operation
 -------------------
 * Jobs are the released jobs, in the order of release.  A source is ready when it was in the
   recording: shortly after a timer's release, possibly long after the header stamp of a message.
-* A worker notices due timers before it chooses its next execution.  A timer that was noticed right
-  after the end of an execution, and was due before, is therefore known at its release: whenever
-  the next execution is chosen, it takes part.  Otherwise it is known when it was noticed.  One
-  worker notices nothing while it runs a callback, so whatever was due meanwhile is known.
+* A worker notices due timers before it chooses its next execution.  If a timer was noticed right
+  after the end of an execution, and was due before that, a worker that had become idle earlier
+  would have noticed it earlier.  So it counts as known from its release.  Any other timer is known
+  from the time at which it was noticed.  A single worker notices nothing while it runs a callback,
+  so all timers that became due meanwhile count as known from their releases.
 * The execution time of a vertex is the sum of the pieces of its execution.  If it did not complete
   (dropped, expired, open at the end), it is the callback's median, otherwise the declared mean.
 * A job that expired at its release never ran: its timer was noticed after its next period.  This
@@ -92,7 +93,13 @@ _COLUMNS = {
     'took': (_VERTEX, 'i8'), 'start': (_VERTEX, 'i8'), 'end': (_VERTEX, 'i8'),
     'cpu': (_VERTEX, 'i8'), 'dispatch': (_VERTEX, 'i4'), 'held': (_VERTEX, 'i2'),
     'arrived': (_EDGE, 'i8'), 'sent': (_EDGE, 'i1')}
-"""Columns by job, by job and vertex, or by job and edge; ns or unknown (``sent``: 1)."""
+"""
+Columns by job, by job and vertex, or by job and edge.  Times are in ns, or ``_UNKNOWN``.
+
+``turn``: when a timer was noticed, if right after an execution; ``busy``: 1 if its worker was
+busy; ``dispatch``: the index of the dispatch time in ``_dispatch_ns``; ``held``: 1 if the
+execution held the interpreter, 0 if not; ``sent``: 1 if the message was published.
+"""
 
 
 class LoadBuilder:
@@ -151,8 +158,8 @@ class LoadBuilder:
             noticed[:] = np.maximum(jobs.release[mine], jobs.noticed[mine])
         self._note_ends()
         self._executions = table = recording.executions
-        #: By execution the row of its job.
         places = recording.job_places
+        #: By execution the row of its job.
         self._row = np.where(places >= 0, places - jobs.first[table['dag']], _UNKNOWN)
         self._note_pieces(n_workers)
         self._note_completions()
@@ -208,13 +215,14 @@ class LoadBuilder:
             self._find_turns(number, start[mine], end[mine])
         ready[~first] = start[~first]
         others = np.flatnonzero(vertex < 0)
-        # ready, duration, dispatch or -1: undeclared callbacks, and legs that completed nothing
+        # ready, duration, index of the dispatch time or -1: undeclared callbacks, and legs that
+        # completed nothing
         self._others = [np.column_stack((ready[others], (end - start)[others], others))]
         source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
         turn = self._columns['turn'][self._places(_JOB, row[source], vertex[source])]
         known = first[source] & (turn >= 0)
         ready[source[known]] = turn[known]
-        self._late = dispatch_times(
+        self._dispatch_ns = dispatch_times(
             n_workers, worker, self._groups(rows, vertex), ready, start, end,
             [mine for _, mine in members],
             holds & (cpu >= 0) & (completes == recorded_tables.VERTEX))
@@ -467,8 +475,9 @@ class LoadBuilder:
         """Return dispatch times by number (the last: the median), the median, and by execution."""
         number = self._columns.pop('dispatch')
         known = number[number >= 0]
-        usual = quantile(memoryview(np.sort(self._late[known])), 0.5) if len(known) else None
-        every = np.append(self._late, usual or 0)     # number -1
+        usual = quantile(
+            memoryview(np.sort(self._dispatch_ns[known])), 0.5) if len(known) else None
+        every = np.append(self._dispatch_ns, usual or 0)     # number -1
         return every, usual, every[number]
 
     def _subtract_others(self, alone: bool) -> None:
