@@ -135,7 +135,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         future.set_result(response)""")], of(
         'test_executor.py', 'test_each_of_many_runs_once[spin-of_services]')),
     Case('coroutines_not_resumed', [(
-        'executor/engine.py', 'self._core().resume(', 'print(')], [
+        'executor/engine.py', 'self._end_bypass().resume(', 'print(')], [
         *of('test_executor.py', 'test_each_of_many_runs_once[spin-of_coroutines]'),
         *of('test_tasks.py',
             'test_a_coroutine_goes_on_in_the_step_after_its_future_is_done[installed]')],
