@@ -21,8 +21,8 @@ Comments (HTML, invisible on the page) right before a block change that:
   all files of the page are there).
 * `<!-- exit: N -->`: it ends with this status.
 * `<!-- in the test: A => B -->`: B is tried in place of A, to be quick.
-* `<!-- measured -->`: an output that differs from run to run: a number stands for any number, and
-  a table may have further columns.
+* `<!-- measured -->`: the output has measured values.  A number in it stands for any number, and a
+  table may have further columns.
 * `<!-- not run: REASON -->`: it is not run, for one of ``REASONS``; what can be checked without
   running it is: Python must compile, YAML must parse, options of `mddag` must exist.
 """
@@ -45,7 +45,13 @@ _BLOCK = re.compile(
     r'^(?P<indent> *)```(?P<language>\w*)[^\n]*\n(?P<text>.*?)^(?P=indent)```$',
     re.MULTILINE | re.DOTALL)
 _MARK = re.compile(r'<!-- (file|exit|in the test|not run|measured)(?:: (.*?))? -->')
-_NUMBER = re.compile(r'-?\d[\d,]*(?:\.\d+)?')
+_NUMBER, _UNIT = r'-?\d[\d,]*(?:\.\d+)?', '(?:ns|us|ms|s)'
+# The parts of a measured output that stand for others, and the regular expression of each.
+_MEASURED = re.compile(
+    rf'(?P<any>…)|(?P<number>{_NUMBER})|(?<=\d )(?P<unit>{_UNIT}\b)|'
+    r'(?P<columns> {2,})|(?P<blank> )')
+_STANDS_FOR = {
+    'any': '.*?', 'number': _NUMBER, 'unit': _UNIT, 'columns': r' [^\n]*?', 'blank': ' +'}
 _TIMEOUT_S = 150.0  # of a command that takes 10 s on an idle machine
 
 
@@ -187,10 +193,11 @@ class Folder:
         text = block.text.rstrip()
         if block.mark('measured') is None:
             return re.escape(text).replace('…', '.*?')
-        text = re.sub(r'(?<=#) (?:ns|us|ms|s)\b', ' UNIT', _NUMBER.sub('#', text))
-        expected = re.escape(text).replace('…', '.*?')
-        expected = re.sub(r'(\\ ){2,}', r' [^\\n]*?', expected).replace(r'\ ', ' +')
-        return expected.replace(r'\#', _NUMBER.pattern).replace('UNIT', '(?:ns|us|ms|s)')
+        parts, end = [], 0
+        for match in _MEASURED.finditer(text):
+            parts += [re.escape(text[end:match.start()]), _STANDS_FOR[match.lastgroup]]
+            end = match.end()
+        return ''.join([*parts, re.escape(text[end:])])
 
     def _run(self, block, command):
         expected = int(block.mark('exit') or 0)
