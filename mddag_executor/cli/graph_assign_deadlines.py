@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
+from mddag_executor.cli.graph_check import required_bounds
 from mddag_executor.cli.text import Cell, format_ns, one_line, Progress, table
 from mddag_executor.text import counted
 
 if TYPE_CHECKING:
     from mddag_executor.laboratory.assign_deadlines import Measured
-    from mddag_executor.results.graphs import AssignResult, AssignResultRare, Bound
+    from mddag_executor.results.graphs import AssignResult, AssignResultRare
     from msg_graph import TaskSet
 
 EXAMPLE = """\
@@ -50,17 +51,11 @@ def main(args: argparse.Namespace) -> int:
         load_with_or_without_deadlines,
         with_deadlines,
     )
-    from msg_graph.segments import bound, why_unbounded
     name, text = common.read_text(args.graph)
     task_set = load_with_or_without_deadlines(text, name, None if args.graph == '-' else name)
     deadlines, measured = _assign(args, task_set)
     common.write_text(args.output, deadlines_in_text(task_set, deadlines))
-    after = with_deadlines(task_set, deadlines)
-    required: dict[str, dict[str, Bound]] = {
-        path.name: {what: {'required_ns': time, 'bound_ns': bound(after, path, what),
-                           'why_unbounded': why_unbounded(after, path, what)}
-                    for what, time in path.requirements.items()}
-        for path in after.paths if path.requirements}
+    required = required_bounds(with_deadlines(task_set, deadlines))
     more: AssignResultRare = {'requirements': required} if required else {}
     result: AssignResult = {
         'policy': args.policy, 'budget': args.budget, 'deadlines_ns': deadlines, **more,

@@ -80,7 +80,6 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> CheckResult:
     """
     from mddag_executor.core import Tables
     from mddag_executor.laboratory.necessary import necessary_tests
-    from msg_graph.segments import bound, why_unbounded
     tables = Tables.build(task_set)
     dags: dict[str, CheckedDag] = {}
     for dag in task_set.dags:
@@ -89,11 +88,7 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> CheckResult:
         dags[dag.name] = _dag_result(dag, offsets, workers)
     loads = [dag['load'] for dag in dags.values() if dag['load'] is not None]
     load = sum(loads) if len(loads) == len(dags) else None
-    required: dict[str, dict[str, Bound]] = {
-        path.name: {what: {'required_ns': time, 'bound_ns': bound(task_set, path, what),
-                           'why_unbounded': why_unbounded(task_set, path, what)}
-                    for what, time in path.requirements.items()}
-        for path in task_set.paths if path.requirements}
+    required = required_bounds(task_set)
     more: CheckResultRare = {'requirements': required} if required else {}
     return {
         'dags': dags,
@@ -113,6 +108,16 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> CheckResult:
         'paths': {path.name: list(path.callbacks) for path in task_set.paths},
         **more,
     }
+
+
+def required_bounds(task_set: TaskSet) -> dict[str, dict[str, Bound]]:
+    """Return by path what is required of it, and how long that takes at most."""
+    from msg_graph.segments import bound, why_unbounded
+    return {
+        path.name: {what: {'required_ns': time, 'bound_ns': bound(task_set, path, what),
+                           'why_unbounded': why_unbounded(task_set, path, what)}
+                    for what, time in path.requirements.items()}
+        for path in task_set.paths if path.requirements}
 
 
 def _dag_result(dag: Dag, rad_offsets: list[int], workers: int) -> CheckedDag:
