@@ -62,6 +62,7 @@ from msg_graph.errors import (
     for_each,
     GraphError,
     listed,
+    nearest,
     quoted,
 )
 from msg_graph.language import CALLBACK_KEYS, Entry
@@ -215,11 +216,9 @@ class _Links:
 
     def _similar_topic(self, callback: Callback, topic: str, otherwise: str) -> str:
         """Return the remedy for a topic that is not published: where a similar one is."""
-        remedy = did_you_mean(topic, self.publishers, otherwise)
-        similar = next((each for each in self.publishers
-                        if remedy == f'did you mean {quoted(each)}?'), None)
+        similar = nearest(topic, self.publishers)
         if similar is None:
-            return remedy
+            return otherwise
         publisher = self.callbacks[self.publishers[similar][0]]
         entry = self.entries[publisher.key]
         line = entry.line_of(

@@ -130,6 +130,12 @@ def listed(texts: Iterable[str], most: int = 8) -> str:
 
 def did_you_mean(word: str, known: Iterable[str], otherwise: str) -> str:
     """Return the remedy for a misspelt word: the nearest known one, else ``otherwise``."""
+    similar = nearest(word, known)
+    return otherwise if similar is None else f'did you mean {quoted(similar)}?'
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Return the known word that is most similar to a misspelt one; None: none is similar."""
     import difflib  # rarely needed
     matches = difflib.get_close_matches(word[:_LONGEST_SHOWN], list(known), n=1)
-    return f'did you mean {quoted(matches[0])}?' if matches else otherwise
+    return matches[0] if matches else None
