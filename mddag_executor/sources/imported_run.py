@@ -46,7 +46,6 @@ from mddag_executor.sources.imported_jobs import ImportedJobs
 from mddag_executor.sources.links import Links, Oddities
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.events import Event
 from mddag_executor.trace.times import credible
 from msg_graph import Process, TaskSet
 import numpy as np
@@ -86,16 +85,15 @@ class ImportedRun:
                 reader, self.kinds, self.others, progress)
         give_back()     # memory of the batches
         starts = self._starts()
-        init = self._initialisation()
         # this executor recorded it, but its executions are lost
         own = any(event[0].name in _OWN for event in self._events.others)
         if head is None and (own or not len(starts)):
             raise no_run(reader)
-        self._link(init)
+        self._link()
         self._clocks = ImportedClocks(self.links)
         if self._clocks.shift:
             self._events = moved(self._events, self._clocks.shift)
-            self._link(self._initialisation())
+            self._link()
             starts = self._starts()
         threads = {self._events.threads[each] for each in np.unique(starts['thread']).tolist()}
         # The policy of another executor is not recorded; its name replaces the pool.
@@ -115,19 +113,17 @@ class ImportedRun:
         self._odd = Oddities(self.odd, 5)
         self._fallbacks: Counter[str] = Counter()
 
-    def _initialisation(self) -> list[Event]:
-        return [event for event in self._events.others if event[0].name in INIT_EVENTS]
-
     def _starts(self) -> Table:
         table = self._events.table
         starts: Table = table[table['kind'] == START]
         return starts
 
-    def _link(self, init: Sequence[Event]) -> None:
+    def _link(self) -> None:
         """Link executions and messages."""
         #: The nodes and callbacks.
         self.who = Entities()
-        self.who.read([event for event in init if event[0].name in INIT_EVENTS])
+        self.who.read([
+            event for event in self._events.others if event[0].name in INIT_EVENTS])
         self.links = self.links_type(self._events, self.who)
 
     def read(self) -> Recording:
