@@ -41,7 +41,7 @@ from mddag_executor.errors import UsageError
 from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.head import Head, is_declared, ReplayError
 from mddag_executor.recording.jobs import Jobs
-from mddag_executor.recording.joins import different, earliest, groups, RowNumbers, sort_by
+from mddag_executor.recording.joins import different, groups, RowNumbers, sort_by
 from mddag_executor.recording.losses import Loss, Losses
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
@@ -50,7 +50,7 @@ from mddag_executor.sources import clocks
 from mddag_executor.sources.entities import Entities
 from mddag_executor.sources.executions import Numbering
 from mddag_executor.sources.head import declared, read_head
-from mddag_executor.sources.own import end_losses, Read, read_process
+from mddag_executor.sources.own import begin_of, end_losses, Read, read_process
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.numbers import Numbers
@@ -321,7 +321,7 @@ class Joined:
             workers_each=max(part.head.workers for part in self._parts),
             hosted=[(int(ranks[place][order]), dag, vertices)
                     for place, order, dag, vertices in self._hosted]), tables['executions'])
-        run = replace(run, start=_begin(tables['releases'], tables['executions']))
+        run = replace(run, start=begin_of(tables['releases'], tables['executions']))
         lost = sum(part.found.lost for part in self._parts)
         return Recording(
             run, Columns(**tables), replace(
@@ -516,9 +516,3 @@ class Joined:
                 f'cut): it ends {max(0, end - part.last) / 1e9:.3f} s before the run; '
                 + (f'{counted(len(jobs), "job")} ended with it: {listed(jobs)}' if jobs
                    else 'no job was open in it')))
-
-
-def _begin(releases: Table, executions: Table) -> int | None:
-    """Return the first release, or when the first execution became ready; None: neither."""
-    return earliest(releases['release'], executions['ready'][
-        (executions['end'] >= 0) & (executions['start'] >= 0)])

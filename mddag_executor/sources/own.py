@@ -131,6 +131,12 @@ def read_process(
         return _Source(reader, name, head, who, edit).read(progress)
 
 
+def begin_of(releases: Table, executions: Table) -> int | None:
+    """Return the first release, or when the first execution became ready; None: neither."""
+    return earliest(releases['release'], executions['ready'][
+        (executions['end'] >= 0) & (executions['start'] >= 0)])
+
+
 def end_losses(run: Run, n_releases: int, lost: int) -> Iterator[Loss]:
     """Yield what the run as a whole lacks."""
     if not run.shut_down:
@@ -243,9 +249,7 @@ class _Source:
         drops, reasons = self._drops()
         run = self._put_in_order(self._with_end(Run(
             self._name, self._head, self._task_set, self._task_set, notices_stops=notices_stops,
-            workers_each=self._head.workers, start=earliest(
-                releases['release'], executions['ready'][
-                    (executions['end'] >= 0) & (executions['start'] >= 0)]))), executions, [
+            workers_each=self._head.workers, start=begin_of(releases, executions))), executions, [
             (releases, releases['noticed'], released_at),
             (job_ends, job_ends['time'], ends_at)], completed)
         times, in_order = self._seen
