@@ -319,7 +319,7 @@ class Chains:
             links['of'] = which[links['of']]
             found.append(links)
         every = concatenate(found)[::-1]    # each chain was followed from its end
-        return every[np.argsort(every['of'], kind='stable')]
+        return every[sort_by(every['of'])]
 
 
 def _parts(done: Table, chain: _Chain) -> tuple[Mask, Table]:

@@ -59,8 +59,6 @@ ONCE_PERIODS = 3
 """A timer fires once if it was silent for so many periods after its only execution."""
 NEVER_PERIODS = 20
 """A timer never fires if a recording of so many periods has no execution of it."""
-
-
 LEAST_COPIED = 5
 """From fewer messages with header stamps nothing is concluded."""
 _NO_STAMPS: Ints = np.empty(0, dtype=np.int64)
@@ -105,8 +103,7 @@ class System:
         self._process_names = recording.names.processes
         self._names = recording.names
         self._end = recording.end
-        begin = recording.end if recording.start is None else recording.start
-        self._length = recording.end - begin
+        self._length = recording.end - recording.run.begin
         self._entities = [entity for entity in sorted(
             self._names.made, key=lambda e: (e.made, KINDS.index(e.kind))) if _is_shown(entity)]
         if not self._entities:

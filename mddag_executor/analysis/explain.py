@@ -45,7 +45,7 @@ from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.columns import concatenate, in_parts, Ints, Mask, rows, Table
-from mddag_executor.recording.joins import different, rows_by
+from mddag_executor.recording.joins import different, rows_by, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
 from mddag_executor.results.replays import (
@@ -124,7 +124,7 @@ class Explanation:
             of_dag['of'] = mine[of_dag['of']]
             links.append(of_dag)
         every = concatenate([rows(LINKS), *links])
-        every = every[np.argsort(every['of'], kind='stable')]
+        every = every[sort_by(every['of'])]
         missed['length'] = np.bincount(every['of'], minlength=len(missed))
         return missed, every
 
