@@ -142,9 +142,11 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
     """Reschedule a recording if that is wanted or it is a bag; else replay it as recorded."""
     if not args.reschedule and not source.is_bag:
         return as_recorded(source, begin=args.begin, end=args.end)
-    settings = {
+    changes = {
         'policy': args.policy, 'workers': args.workers, 'preemptive': args.preemptive,
-        'on_late': args.on_late, 'skip': args.begin or 0, 'cpus': args.cpus, 'name': source.name}
+        'on_late': args.on_late, 'cpus': args.cpus}
+    skip, name = args.begin or 0, source.name
+    settings = {**changes, 'skip': skip, 'name': name}
     if source.is_bag:
         return _rescheduled_bag(args, source, settings)
     options.reject_options(args, ('execution_times', 'seed'),
@@ -152,14 +154,14 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
     from mddag_executor.sources.open import open_recording
     from mddag_executor.whatif.agreement import disagreement
     from mddag_executor.whatif.reschedule import reschedule
-    processes, skip, name = _processes(args), args.begin or 0, source.name
+    processes = _processes(args)
     with Progress('replaying') as line:
         recording = open_recording(source.path, source.task_set, name, line.events)
         outcome = reschedule(
             recording, overheads=args.overheads is None, dispatch_overhead=args.overheads or 0,
             processes=processes, **settings)
-        is_changed = args.overheads is not None or processes is not None or any(
-            value is not None for key, value in settings.items() if key not in ('skip', 'name'))
+        is_changed = any(
+            each is not None for each in (args.overheads, processes, *changes.values()))
         text = disagreement(reschedule(recording, skip=skip) if is_changed else outcome)
     if text is not None:
         outcome.warnings.append(text)
