@@ -537,11 +537,6 @@ class Host:
 
     # --- signals ---------------------------------------------------------------------------------
 
-    @property
-    def ended_by(self) -> int | None:
-        """Return the signal that has ended the run; None: none has."""
-        return self._signals.ended_by
-
     def ends_run(self, number: int) -> bool:
         """
         Let programs note a signal; return whether it ends the run.
