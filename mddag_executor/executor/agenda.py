@@ -3,7 +3,7 @@
 """
 Everything that has to be done at a time: timers, deadlines, checks and calls.
 
-All times are monotonic ns; ``NEVER`` stands for no time.
+All times are ns of the monotonic clock. ``NEVER`` is later than all of them: nothing is due.
 """
 
 from __future__ import annotations
