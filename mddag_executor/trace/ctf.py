@@ -5,8 +5,9 @@ Imports CARET and ros2_tracing recordings: LTTng sessions in the Common Trace Fo
 
 Theory of operation:
 
-1. The packets of the session are read here, on columns (`tsdl`, `ctf_layout`, `ctf_stream`); no
-   other program is needed.  What is damaged is read up to the damage, with a warning.
+1. The packets of the session are read here, on columns (`ctf_layout`, `ctf_stream`), as the
+   metadata of CTF 1.8 or 2 describes them (`tsdl`, `ctf2_metadata`); no other program is needed.
+   What is damaged is read up to the damage, with a warning.
 2. All traces of a session (processes, kernel, rotated chunks) are read as one stream in the order
    of time, and so are several sessions of one host: the metadata has its name, and the UUID of its
    clock, which is that of its boot.  The sessions of several hosts are written one after the
@@ -44,6 +45,7 @@ from typing import Any, NamedTuple
 from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.columns import Columns, ColumnWriter
+from mddag_executor.trace.ctf2_metadata import is_ctf2, parse_ctf2
 from mddag_executor.trace.ctf_layout import text_of
 from mddag_executor.trace.ctf_stream import (
     Array,
@@ -55,6 +57,7 @@ from mddag_executor.trace.ctf_stream import (
     Reading,
     Rows,
 )
+from mddag_executor.trace.ctf_types import Metadata, MetadataError, MOST_BYTES
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.numbers import Numbers
 from mddag_executor.trace.schema import (
@@ -67,7 +70,7 @@ from mddag_executor.trace.schema import (
     PROCESS,
 )
 from mddag_executor.trace.trace_file import TraceFile, whole_trace
-from mddag_executor.trace.tsdl import Metadata, parse_tsdl, TsdlError
+from mddag_executor.trace.tsdl import parse_tsdl
 import numpy as np
 
 _CACHE = 'caret_converted'
@@ -103,12 +106,12 @@ class _Session(NamedTuple):
     """
     A session, or the two of `ros2 trace --dual-session`.
 
-    :ivar traces: the folders of its traces.
+    :ivar traces: what the metadata of its traces says, by their folders.
     :ivar parts: how many sessions it is.
     """
 
     path: str
-    traces: list[str]
+    traces: dict[str, Metadata]
     parts: int
     host: _Host
 
@@ -155,8 +158,8 @@ def _written(
         for sessions in hosts:
             several = sum(each.parts for each in sessions) > 1
             importer.begin(several)
-            reading = Reading({folder: _metadata_in(folder) for each in sessions
-                               for folder in each.traces}, raw=several)
+            reading = Reading({folder: metadata for each in sessions
+                               for folder, metadata in each.traces.items()}, raw=several)
             for events, lost in reading.batches():
                 importer.take(events, lost)
                 if progress is not None:
@@ -173,13 +176,16 @@ def _metadata_in(folder: str) -> Metadata:
     :raises TraceError: if it is not understood
     """
     path = os.path.join(folder, 'metadata')
-    text = _text_of_metadata(path)
-    if text.lstrip()[:1] in (b'\x1e', b'{'):
-        raise TraceError(path, 'is in CTF 2, which is not read',
-                         'record with lttng create --trace-format=ctf-1.8')
+    data = _text_of_metadata(path)
     try:
-        return parse_tsdl(text)
-    except TsdlError as error:
+        if len(data) > MOST_BYTES:
+            raise MetadataError(f'it is larger than {MOST_BYTES // 2 ** 20} MiB')
+        text = data.decode()
+        return parse_ctf2(text) if is_ctf2(text) else parse_tsdl(text)
+    except UnicodeDecodeError as error:
+        raise TraceError(path, f'cannot be read (it is no text at byte {error.start})',
+                         _RECORD) from None
+    except MetadataError as error:
         raise TraceError(path, f'cannot be read ({error})', _RECORD) from None
 
 
@@ -208,13 +214,17 @@ def _session_in(path: str) -> _Session:
             above = parts[:below[0]]
             sessions.add(os.sep.join(above[:-1] if above and _SNAPSHOT.fullmatch(above[-1])
                                      else above))
-    hosts = {_host_of(os.path.join(folder, 'metadata')) for folder in folders}
-    if len(sessions) > 1 and (sessions != _DUAL or len(hosts) > 1):
-        raise TraceError(
-            path, f'it holds {len(sessions)} sessions: {listed(sorted(sessions))}',
-            'name the folder of one, or, if they are of one run, each of their folders')
+    several = TraceError(
+        path, f'it holds {len(sessions)} sessions: {listed(sorted(sessions))}',
+        'name the folder of one, or, if they are of one run, each of their folders')
+    if len(sessions) > 1 and sessions != _DUAL:
+        raise several
+    traces = {folder: _metadata_in(folder) for folder in folders}
+    hosts = {_host_of(metadata) for metadata in traces.values()}
+    if len(sessions) > 1 and len(hosts) > 1:
+        raise several
     host = hosts.pop() if len(hosts) == 1 else None
-    return _Session(path, folders, max(1, len(sessions)), host or (os.path.realpath(path), ''))
+    return _Session(path, traces, max(1, len(sessions)), host or (os.path.realpath(path), ''))
 
 
 # The folders that LTTng makes in a session's folder; that of each snapshot is above them.
@@ -228,18 +238,10 @@ _PACKET = '16sIII5B'
 _MAGIC = 0x75D11D57
 
 
-# In the TSDL of CTF 1.8 and in the JSON of CTF 2.
-_HOSTNAME = re.compile(rb'\bhostname"?\s*[=:]\s*"([^"]*)"')
-_CLOCK_UUID = re.compile(rb'\bclock\s*\{[^}]*?\buuid\s*=\s*"([^"]*)"')
-
-
-def _host_of(path: str) -> _Host | None:
-    """Return the host that wrote metadata; None if the metadata does not say it."""
-    text = _text_of_metadata(path)
-    name, clock = _HOSTNAME.search(text), _CLOCK_UUID.search(text)
-    if name is None:
-        return None
-    return name[1].decode(errors='replace'), clock[1].decode(errors='replace') if clock else ''
+def _host_of(metadata: Metadata) -> _Host | None:
+    """Return the host of a trace; None if its metadata does not say it."""
+    name = metadata.environment.get('hostname')
+    return None if name is None else (name, metadata.clock.uuid)
 
 
 def _text_of_metadata(path: str) -> bytes:

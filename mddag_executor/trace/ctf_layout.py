@@ -18,11 +18,12 @@ import json
 import struct
 from typing import Any, NamedTuple
 
-from mddag_executor.trace.tsdl import (
+from mddag_executor.trace.ctf_types import (
     Array,
     Enumeration,
     Float,
     Integer,
+    Location,
     smallest,
     Struct,
     Text,
@@ -240,13 +241,22 @@ class Cursor:
 
     :ivar at: the place, in bits, and ``end`` that of the end.
     :ivar scopes: the fields of the structures read so far, outer ones first.
+    :ivar origins: the places in ``scopes`` of those that have a name (``Location.origin``).
     """
 
-    __slots__ = ('at', 'data', 'end', 'scopes')
+    __slots__ = ('at', 'data', 'end', 'origins', 'scopes')
 
     def __init__(self, data: bytes, at: int, end: int) -> None:
         self.data, self.at, self.end = data, at, end
         self.scopes: list[dict[str, Any]] = []
+        self.origins: dict[str, int] = {}
+
+    def read(self, origin: str, reader: Reader) -> dict[str, Any]:
+        """Read the structure with a name, whose fields later ones may refer to."""
+        self.origins[origin] = len(self.scopes)
+        found: dict[str, Any] = reader(self)
+        self.scopes.append(found)
+        return found
 
     def take(self, align: int, size: int) -> int:
         """Return the place of something, and go behind it."""
@@ -256,18 +266,27 @@ class Cursor:
         self.at = at + size
         return at
 
-    def find(self, path: str) -> Any:
-        """Return the value of a field that an array or a variant refers to."""
-        first, *rest = path.split('.')
-        if first in ('trace', 'stream', 'event', 'packet', 'env'):
-            first, rest = path.rpartition('.')[2], []
-        for scope in reversed(self.scopes):
-            if first in scope:
-                found = scope[first]
-                for name in rest:
+    def find(self, location: Location, prefix: str = '') -> Any:
+        """
+        Return the value of a field that an array or a variant refers to.
+
+        :param prefix: of the last name.
+        """
+        path, origin, above = location
+        *names, last = path
+        names.append(prefix + last)
+        if origin:
+            scopes = self.scopes[self.origins.get(origin, len(self.scopes)):][:1]
+        elif above >= 0:
+            scopes = self.scopes[::-1][above:][:1]
+        else:
+            scopes = self.scopes[::-1]
+        for found in scopes:
+            if names[0] in found:
+                for name in names:
                     found = found[name]
                 return found
-        raise Damaged(f'there is no field {path!r}')
+        raise Damaged(f'there is no field {".".join(path)!r}')
 
 
 Reader = Callable[[Cursor], Any]
@@ -329,22 +348,21 @@ def text_of(data: bytes) -> str:
 
 
 def _array_reader(kind: Array) -> Reader:
-    count, length, element = kind.count, kind.length, kind.element
+    count, length, element, align = kind.count, kind.length, kind.element, kind.align
     least = smallest(element)
     one = reader_of(element)
 
     def size(cursor: Cursor) -> int:
-        found = count if count >= 0 else cursor.find(length)
+        found = count if length is None else cursor.find(length)
+        cursor.take(align, 0)
         if not isinstance(found, int) or not 0 <= found <= (cursor.end - cursor.at) // least:
             raise Damaged('an array is longer than its event')
         return found
 
     if kind.text:
-        align = element.align
-
         def read_text(cursor: Cursor) -> str:
             number = size(cursor)
-            start = cursor.take(align, number * 8) // 8
+            start = cursor.take(8, number * 8) // 8
             return text_of(cursor.data[start:start + number])
 
         return read_text
@@ -371,12 +389,16 @@ def _struct_reader(kind: Struct) -> Reader:
 
 
 def _variant_reader(kind: Variant) -> Reader:
-    options = {name: reader_of(inner) for name, inner in kind.options}
-    above, dot, last = kind.tag.rpartition('.')
-    tag = f'{above}{dot}{_LABEL}{last}'
+    options: dict[Any, Reader] = {name: reader_of(inner) for name, inner in kind.options}
+    tag, ranges = kind.tag, kind.ranges
 
     def read(cursor: Cursor) -> Any:
-        option = options.get(cursor.find(tag))
+        if ranges:
+            value = cursor.find(tag)
+            name = next((name for name, low, high in ranges if low <= value <= high), None)
+        else:
+            name = cursor.find(tag, _LABEL)
+        option = options.get(name)
         if option is None:
             raise Damaged('a variant of an unknown kind')
         return option(cursor)

@@ -45,13 +45,13 @@ from mddag_executor.trace.ctf_layout import (
     reader_of,
     values_of,
 )
-from mddag_executor.trace.tsdl import (
+from mddag_executor.trace.ctf_types import (
     Enumeration,
     Integer,
     Metadata,
+    MetadataError,
     StreamClass,
     Struct,
-    TsdlError,
     Type,
     Variant,
 )
@@ -337,7 +337,7 @@ class Decoder:
         self._forms = _forms_of(header) if header and header.members else []
         short = {form.bits for form in self._forms if form.stamp and form.bits < 64}
         if len(short) > 1:
-            raise TsdlError('the times of its events are of several sizes')
+            raise MetadataError('the times of its events are of several sizes')
         #: Bits of the times that are not whole.
         self.short_bits = min(short, default=0)
         self._context = reader_of(stream.context) if stream.context else None
@@ -475,18 +475,18 @@ class Decoder:
         try:
             number = stamp = bits = 0
             if self._header is not None:
-                head = self._header(cursor)
-                cursor.scopes.append(head)
+                head = cursor.read('event-record-header', self._header)
                 number, stamp, bits = self._read_head(head)
             context: dict[str, Any] = {}
             if self._context is not None:
-                context = self._context(cursor)
-                cursor.scopes.append(context)
+                context = cursor.read('event-record-common-context', self._context)
             special, payload, kind = self._reader(number)
             if special is not None:
-                cursor.scopes.append(special(cursor))
+                cursor.read('event-record-specific-context', special)
             start = cursor.at
-            values = values_of(kind.fields, payload(cursor)) if payload is not None else ()
+            values: tuple[Any, ...] = ()
+            if payload is not None:
+                values = values_of(kind.fields, cursor.read('event-record-payload', payload))
             identity = tuple(_within(context, path) for path in self.identity)
         except (Damaged, struct.error, KeyError, TypeError) as error:
             return str(error) if isinstance(error, Damaged) else 'an event is not understood'
@@ -583,7 +583,7 @@ def _forms_of(header: Struct) -> list[_Form]:
     LTTng's heads are a number, and a variant that it chooses: for small numbers only a time of few
     bits, otherwise the number and the whole time.
 
-    :raises TsdlError: if it has others
+    :raises MetadataError: if it has others
     """
     variants = [(name, inner) for name, inner in header.members if isinstance(inner, Variant)]
     if not variants:
@@ -591,15 +591,16 @@ def _forms_of(header: Struct) -> list[_Form]:
     (name, choice), tag = variants[0], dict(header.members).get('id')
     options = dict(choice.options)
     forms: list[_Form] = []
-    if len(variants) == 1 and isinstance(tag, Enumeration) and choice.tag == 'id':
-        for label, low, high in tag.labels[:16]:
+    ranges = choice.ranges or (tag.labels if isinstance(tag, Enumeration) else ())
+    if len(variants) == 1 and choice.tag.path == ('id',):
+        for label, low, high in ranges[:16]:
             if label in options:
                 members = tuple((each, options[label] if each == name else inner)
                                 for each, inner in header.members)
                 forms.append(_form(Struct(members, header.align, 1), low, high))
-    ranges = sorted((form.low, form.high) for form in forms)
-    if not forms or any(after[0] <= before[1] for before, after in zip(ranges, ranges[1:])):
-        raise TsdlError('the heads of its events are not those of LTTng')
+    taken = sorted((form.low, form.high) for form in forms)
+    if not forms or any(after[0] <= before[1] for before, after in zip(taken, taken[1:])):
+        raise MetadataError('the heads of its events are not those of LTTng')
     return forms
 
 
@@ -816,8 +817,7 @@ def read_head(trace: Trace, file: str, offset: int, size: int) -> _HeadOfPacket:
     context: dict[str, Any] = {}
     try:
         if metadata.packet_header is not None:
-            header = reader_of(metadata.packet_header)(cursor)
-        cursor.scopes.append(header)
+            header = cursor.read('packet-header', reader_of(metadata.packet_header))
         if header.get('magic', _MAGIC) != _MAGIC:
             raise Damaged('a packet does not begin as packets do')
         uuid = header.get('uuid')
@@ -829,7 +829,7 @@ def read_head(trace: Trace, file: str, offset: int, size: int) -> _HeadOfPacket:
             raise Damaged(f'a packet is of an unknown stream ({number})')
         of_stream = metadata.streams[number].packet_context
         if of_stream is not None:
-            context = reader_of(of_stream)(cursor)
+            context = cursor.read('packet-context', reader_of(of_stream))
         values = {name: context.get(name, default) for name, default in (
             ('packet_size', (size - offset) * 8), ('timestamp_begin', 0), ('timestamp_end', 0),
             ('events_discarded', -1), ('packet_seq_num', -1))}

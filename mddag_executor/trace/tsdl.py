@@ -3,174 +3,40 @@
 """
 Reads the metadata of a CTF 1.8 trace: the types of its packets and events, in TSDL.
 
-Source: the Common Trace Format 1.8.3 (https://diamon.org/ctf).  Read is what LTTng writes: type
-aliases, named and nested structures, variants, enumerations, arrays and sequences.  What is
-written is checked: sizes, alignments, and how deep and how large types are, because every type is
-turned into a layout later.  Names lose a leading underscore, which LTTng puts there.
+Source: the Common Trace Format 1.8.3 (https://diamon.org/ctf/v1.8.3).  Read is what LTTng writes:
+type aliases, named and nested structures, variants, enumerations, arrays and sequences.  Names
+lose a leading underscore, which LTTng puts there.
 """
 
 from __future__ import annotations
 
 from collections import ChainMap
-from dataclasses import dataclass, field
 import re
 from typing import TypeVar
 
-MOST_MEMBERS = 5000
-"""Primitive members of one structure, nested ones included."""
-_MOST_BYTES = 8 * 1024 * 1024
-_DEEPEST = 24
-_NS = 10 ** 9
-
-
-class TsdlError(ValueError):
-    """Metadata that cannot be understood."""
-
-
-@dataclass(frozen=True)
-class Integer:
-    """
-    An integer.
-
-    :ivar align: bits, as in all types.
-    :ivar text: whether it is a character.
-    :ivar clock: whether it is a time of the clock.
-    """
-
-    bits: int
-    align: int
-    signed: bool = False
-    big: bool = False
-    text: bool = False
-    clock: bool = False
-    leaves = 1
-
-
-@dataclass(frozen=True)
-class Float:
-    """A floating-point number of 32 or 64 bits."""
-
-    bits: int
-    align: int
-    big: bool = False
-    leaves = 1
-
-
-@dataclass(frozen=True)
-class Text:
-    """Characters that end with NUL."""
-
-    align = 8
-    leaves = 1
-
-
-@dataclass(frozen=True)
-class Enumeration:
-    """An integer whose values have names: name, first and last value."""
-
-    container: Integer
-    labels: tuple[tuple[str, int, int], ...]
-    leaves = 1
-
-    @property
-    def align(self) -> int:
-        """Return the alignment of the integer."""
-        return self.container.align
-
-    def label(self, value: int) -> str | None:
-        """Return the first name of a value; None: it has none."""
-        return next((name for name, low, high in self.labels if low <= value <= high), None)
-
-
-@dataclass(frozen=True)
-class Array:
-    """A number of elements that is known (`count`) or that another field has (`length`)."""
-
-    element: Type
-    count: int
-    length: str = ''
-
-    @property
-    def align(self) -> int:
-        """Return the alignment of an element."""
-        return self.element.align
-
-    @property
-    def leaves(self) -> int:
-        """Return how many primitives a type consists of."""
-        return self.element.leaves
-
-    @property
-    def text(self) -> bool:
-        """Return whether it is a text of characters of a byte."""
-        element = self.element
-        return isinstance(element, Integer) and element.text and element.bits == 8 and (
-            element.align % 8 == 0)
-
-
-@dataclass(frozen=True)
-class Struct:
-    """Named members."""
-
-    members: tuple[tuple[str, Type], ...]
-    align: int
-    leaves: int
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One of several types, chosen by the name of an enumeration's value."""
-
-    tag: str
-    options: tuple[tuple[str, Type], ...]
-    leaves: int
-    align = 1
-
-
-Type = Integer | Float | Text | Enumeration | Array | Struct | Variant
-
-
-@dataclass
-class EventClass:
-    """A kind of event of a stream."""
-
-    name: str = ''
-    context: Struct | None = None
-    payload: Struct | None = None
-
-
-@dataclass
-class StreamClass:
-    """What the packets and events of a stream consist of."""
-
-    packet_context: Struct | None = None
-    header: Struct | None = None
-    context: Struct | None = None
-    events: dict[int, EventClass] = field(default_factory=dict)
-
-
-@dataclass
-class Clock:
-    """
-    A clock.
-
-    :ivar offset: ns from its 0 to the epoch's.
-    """
-
-    frequency: int = _NS
-    offset: int = 0
-
-
-@dataclass
-class Metadata:
-    """The types of a trace."""
-
-    uuid: str = ''
-    packet_header: Struct | None = None
-    environment: dict[str, str] = field(default_factory=dict)
-    clock: Clock = field(default_factory=Clock)
-    streams: dict[int, StreamClass] = field(default_factory=dict)
-
+from mddag_executor.trace.ctf_types import (
+    alignment_of,
+    Array,
+    array,
+    Clock,
+    DEEPEST,
+    Enumeration,
+    EventClass,
+    Float,
+    Integer,
+    Location,
+    Metadata,
+    MetadataError,
+    NS,
+    size_of,
+    StreamClass,
+    Struct,
+    structure,
+    Text,
+    Type,
+    Variant,
+    variant,
+)
 
 _TOKEN = re.compile(
     r'/\*.*?\*/|//[^\n]*|\s+|("(?:[^"\\\n]|\\.)*"|:=|\.\.\.|->|[A-Za-z_][A-Za-z0-9_]*'
@@ -180,6 +46,7 @@ _CONTROL = re.compile(r'[\0-\x08\x0e-\x1f\x7f]')
 _WORD = re.compile(r'[A-Za-z_][A-Za-z0-9_]*')
 _NUMBER = re.compile(r'-?(0[xX][0-9a-fA-F]{1,16}|0[bB][01]{1,64}|[0-9]{1,20})[uUlL]{0,3}')
 _ESCAPE = re.compile(r'\\(.)', re.DOTALL)
+_SCOPES = frozenset({'trace', 'stream', 'event', 'packet', 'env'})
 
 # What a block of this kind says, and which names of integers are its own.
 _Attributes = dict[str, str]
@@ -187,24 +54,18 @@ _Names = ChainMap[str, Type]
 _T = TypeVar('_T', Struct, Variant, Enumeration)
 
 
-def parse_tsdl(data: bytes) -> Metadata:
+def parse_tsdl(text: str) -> Metadata:
     """
     Return what a metadata text says.
 
-    :raises TsdlError: if it is not understood
+    :raises MetadataError: if it is not understood
     """
-    if len(data) > _MOST_BYTES:
-        raise TsdlError(f'it is larger than {_MOST_BYTES // 2 ** 20} MiB')
-    try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        raise TsdlError(f'it is no text at byte {error.start}') from None
     if _CONTROL.search(text):
-        raise TsdlError('it has control characters')
+        raise MetadataError('it has control characters')
     tokens = [token for token in _TOKEN.findall(text) if token]
     odd = _ODD.intersection(tokens)
     if odd:
-        raise TsdlError(f'it has {min(odd)} where it cannot be')
+        raise MetadataError(f'it has {min(odd)} where it cannot be')
     return _Parser(tokens).parse()
 
 
@@ -220,7 +81,7 @@ def _unquoted(text: str) -> str:
 def _number(text: str) -> int:
     match = _NUMBER.fullmatch(text)
     if match is None:
-        raise TsdlError(f'{text[:40]!r} is no number')
+        raise MetadataError(f'{text[:40]!r} is no number')
     digits = match[1]
     value = int(digits, 8) if re.fullmatch(r'0[0-7]+', digits) else int(digits, 0) if (
         digits[1:2].isalpha()) else int(digits)
@@ -228,17 +89,11 @@ def _number(text: str) -> int:
 
 
 def _size(text: str, most: int) -> int:
-    value = _number(text)
-    if not 1 <= value <= most:
-        raise TsdlError(f'{text[:40]!r} is no possible size')
-    return value
+    return size_of(_number(text), most)
 
 
 def _alignment(text: str) -> int:
-    value = _size(text, 4096)
-    if value & value - 1:
-        raise TsdlError(f'{text[:40]!r} is no possible alignment')
-    return value
+    return alignment_of(_number(text))
 
 
 class _Parser:
@@ -262,24 +117,24 @@ class _Parser:
                     depth += (tokens[before] == '}') - (tokens[before] == '{')
                 if tokens[before - 1] == 'trace':
                     return self._is_big(tokens[at + 2])
-        raise TsdlError('the byte order is missing')
+        raise MetadataError('the byte order is missing')
 
     def _is_big(self, text: str) -> bool:
         if text not in ('le', 'be', 'network', 'native'):
-            raise TsdlError(f'{text[:40]!r} is no byte order')
+            raise MetadataError(f'{text[:40]!r} is no byte order')
         return self._big if text == 'native' else text != 'le'
 
     # --- tokens ----------------------------------------------------------------------------------
 
-    def _error(self, at: int | None = None) -> TsdlError:
+    def _error(self, at: int | None = None) -> MetadataError:
         at = self._at if at is None else at
         near = ' '.join(self._tokens[max(0, at - 3):at + 3])
-        return TsdlError(f'it is not understood near {near[:80]!r}')
+        return MetadataError(f'it is not understood near {near[:80]!r}')
 
     def _next(self) -> str:
         token = self._tokens[self._at]
         if not token:
-            raise TsdlError('it ends early')
+            raise MetadataError('it ends early')
         self._at += 1
         return token
 
@@ -319,9 +174,9 @@ class _Parser:
                 self._definition()
         for stream, number, event in events:
             if stream not in found.streams:
-                raise TsdlError(f'event {event.name!r} is of no stream')
+                raise MetadataError(f'event {event.name!r} is of no stream')
             if number in found.streams[stream].events:
-                raise TsdlError(f'two events of a stream have the number {number}')
+                raise MetadataError(f'two events of a stream have the number {number}')
             found.streams[stream].events[number] = event
         return found
 
@@ -335,12 +190,12 @@ class _Parser:
         elif kind == 'clock':
             frequency = _size(values.get('freq', '1000000000'), 2 ** 33)
             found.clock = Clock(
-                frequency, _number(values.get('offset_s', '0')) * _NS
-                + _number(values.get('offset', '0')) * _NS // frequency)
+                frequency, _number(values.get('offset_s', '0')) * NS
+                + _number(values.get('offset', '0')) * NS // frequency, values.get('uuid', ''))
         elif kind == 'stream':
             number = _number(values.get('id', '0'))
             if number in found.streams:
-                raise TsdlError(f'two streams have the number {number}')
+                raise MetadataError(f'two streams have the number {number}')
             found.streams[number] = StreamClass(
                 types.get('packet.context'), types.get('event.header'),
                 types.get('event.context'))
@@ -403,12 +258,10 @@ class _Parser:
     def _type(self) -> Type:
         """Return the type that comes next."""
         self._depth += 1
-        if self._depth > _DEEPEST:
-            raise TsdlError('its types are nested too deep')
+        if self._depth > DEEPEST:
+            raise MetadataError('its types are nested too deep')
         found = self._any_type()
         self._depth -= 1
-        if found.leaves > MOST_MEMBERS:
-            raise TsdlError(f'a type has more than {MOST_MEMBERS} members')
         return found
 
     def _any_type(self) -> Type:
@@ -454,7 +307,7 @@ class _Parser:
         bits = {(8, 24): 32, (11, 53): 64}.get((
             _size(values.get('exp_dig', ''), 64), _size(values.get('mant_dig', ''), 128)))
         if bits is None:
-            raise TsdlError('it has floating-point numbers other than of 32 and 64 bits')
+            raise MetadataError('it has floating-point numbers other than of 32 and 64 bits')
         return Float(bits, _alignment(values.get('align', '1')),
                      self._is_big(values.get('byte_order', 'native')))
 
@@ -462,36 +315,30 @@ class _Parser:
         name = self._name()
         if not self._accept('{'):
             return self._named('struct', name, Struct)
-        members = self._members()
-        align = max((kind.align for _, kind in members), default=1)
+        members, align = self._members(), 1
         if self._accept('align'):
             self._expect('(')
-            align = max(align, _alignment(self._next()))
+            align = _alignment(self._next())
             self._expect(')')
-        found = Struct(members, align, max(1, sum(kind.leaves for _, kind in members)))
-        return self._define('struct', name, found)
+        return self._define('struct', name, structure(members, align))
 
     def _variant(self) -> Variant:
-        name, tag = self._name(), ''
+        name, tag = self._name(), Location(())
         if self._accept('<'):
-            tag = _plain(self._word())
+            names = [self._word()]
             while self._accept('.'):
-                tag += '.' + _plain(self._word())
+                names.append(self._word())
             self._expect('>')
+            tag = _location(names)
         if self._accept('{'):
-            options = self._members()
-            found = self._define('variant', name, Variant(
-                tag, options, max(1, sum(kind.leaves for _, kind in options))))
-        else:
-            found = self._named('variant', name, Variant)
-            found = Variant(tag or found.tag, found.options, found.leaves)
-        return found
+            return self._define('variant', name, variant(tag, self._members()))
+        found = self._named('variant', name, Variant)
+        return Variant(tag if tag.path else found.tag, found.options, found.leaves)
 
-    def _members(self) -> tuple[tuple[str, Type], ...]:
+    def _members(self) -> dict[str, Type]:
         """Return the members of a structure or variant, whose brace is open."""
         members: dict[str, Type] = {}
         self._names = self._names.new_child()
-        leaves = 0
         while not self._accept('}'):
             if self._peek() == 'typealias':
                 self._definition()
@@ -507,15 +354,12 @@ class _Parser:
                 self._expect(']')
             for length in reversed(lengths):
                 kind = _array(kind, length)
-            if len(lengths) > _DEEPEST or name in members:
+            if len(lengths) > DEEPEST or name in members:
                 raise self._error()
             self._expect(';')
             members[name] = kind
-            leaves += kind.leaves
-            if leaves > MOST_MEMBERS:
-                raise TsdlError(f'a type has more than {MOST_MEMBERS} members')
         self._names = self._names.parents
-        return tuple(members.items())
+        return members
 
     def _member_type(self) -> Type:
         """Return a member's type; the last of several words is the member's name."""
@@ -576,24 +420,11 @@ class _Parser:
 
 
 def _array(element: Type, length: str) -> Array:
-    """Return an array whose elements need space, so that its length has a bound."""
-    if smallest(element) == 0:
-        raise TsdlError('it has an array of elements without a size')
     if length[:1].isdigit():
-        return Array(element, _size(length, 2 ** 32) if _number(length) else 0)
-    return Array(element, -1, '.'.join(map(_plain, length.split('.'))))
+        return array(element, _size(length, 2 ** 32) if _number(length) else 0)
+    return array(element, -1, _location(length.split('.')))
 
 
-def smallest(kind: Type) -> int:
-    """Return the least bits that a type needs."""
-    if isinstance(kind, (Integer, Float)):
-        return kind.bits
-    if isinstance(kind, Enumeration):
-        return kind.container.bits
-    if isinstance(kind, Text):
-        return 8
-    if isinstance(kind, Array):
-        return max(0, kind.count) * smallest(kind.element)
-    if isinstance(kind, Struct):
-        return sum(smallest(inner) for _, inner in kind.members)
-    return min((smallest(inner) for _, inner in kind.options), default=0)
+def _location(names: list[str]) -> Location:
+    """Return the location of a member; that in a scope (`stream.event.header.id`) by its name."""
+    return Location(tuple(map(_plain, names[-1:] if names[0] in _SCOPES else names)))

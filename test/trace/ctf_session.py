@@ -7,7 +7,7 @@ import struct
 CLOCK_OFFSET = 1_732_000_000_000_000_000
 MAGIC = 0xC1FC1FC1
 
-_HEAD = """/* CTF 1.8 */
+METADATA = """/* CTF 1.8 */
 typealias integer {{ size = 32; align = 8; signed = false; }} := uint32_t;
 typealias integer {{ size = 64; align = 8; signed = false; }} := uint64_t;
 typealias integer {{ size = 64; align = 8; signed = false; }} := unsigned long;
@@ -72,7 +72,7 @@ def session(folder, kinds, events, *, context=True, discarded=0, environment=Non
     """
     folder.mkdir(parents=True)
     lines = ''.join(f'  {name} = "{value}";\n' for name, value in (environment or {}).items())
-    text = _HEAD.format(
+    text = METADATA.format(
         offset=CLOCK_OFFSET, boot=f'uuid = "{boot}"; ' if boot else '',
         order='le' if order == '<' else 'be', head=_HEADS[head],
         context=CONTEXT if context else '',

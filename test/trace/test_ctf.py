@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Importing CTF sessions: every event with every field, and damage said in one line."""
 
+import json
 import pickle
 import re
 import struct
@@ -11,7 +12,8 @@ from mddag_executor.trace import import_ctf, read_events, TraceError, TraceReade
 import pytest
 
 from ..sources.caret import CARET
-from ..trace.ctf_session import CLOCK_OFFSET, session
+from ..trace.ctf2 import fragments, to_ctf2
+from ..trace.ctf_session import CLOCK_OFFSET, METADATA, session
 
 START = ('ros2:callback_start', [('callback', 'u64'), ('is_intra_process', 'i32')])
 END = ('ros2:callback_end', [('callback', 'u64')])
@@ -123,6 +125,30 @@ def test_heads_of_events_are_those_of_lttng(head, order, ids, tmp_path):
         (time, pid, tid, *values) for _, time, pid, tid, _, *values in events]
 
 
+def contents(path):
+    """Return all that a trace has: types of events, and events with their fields."""
+    reader = TraceReader(path)
+    return dict(reader.fields), list(reader.events())
+
+
+@pytest.mark.parametrize('renamed', [str, 'X{}'.format])
+@pytest.mark.parametrize(('head', 'order', 'ids'), HEADS)
+def test_ctf2_is_read_as_ctf_1_8(head, order, ids, renamed, tmp_path):
+    """Roles say what the heads of packets and events mean, whatever the names of members are."""
+    kinds = [START, ('my:frame', [('timestamp', 'i64'), ('ratio', 'f64'), ('label', 'str'),
+                                  ('box', 'i32[4]'), ('points', 'f64[]'), ('comm', 'text[6]')])]
+    events = [(k % 2, time, 10 + k % 2, 20 + k % 4, 'p', *(
+        (2 ** 63 + k, k % 2), (-k, k / 8, 'Größe', (k, -2, 3, -2**31), (0.5,) * (k % 3), 'comm'))[
+            k % 2]) for k, time in enumerate(seconds(40, 2 ** 25))]
+    folder = session(
+        tmp_path / 's', kinds, events, head=head, order=order, ids=ids, packets=[0, 1, -1, 3],
+        discarded=5, environment={'hostname': 'robot', 'tracer_major': 2}, boot='a-b')
+    first = import_ctf(folder, tmp_path / 'ctf1.mcap')
+    second = import_ctf(to_ctf2(folder, packets=True, renamed=renamed), tmp_path / 'ctf2.mcap')
+    assert second == first and first.discarded == 6
+    assert contents(tmp_path / 'ctf2.mcap') == contents(tmp_path / 'ctf1.mcap')
+
+
 ODD = 'integer { size = %d; align = %d; signed = %d; }'
 CHOICE = """struct { enum : integer { size = 8; } { none, number = 4 ... 6, word = 9 } what_tag;
   variant <what_tag> { struct { } none; integer { size = 32; align = 8; } number; string word; }
@@ -151,6 +177,66 @@ def test_fields_of_all_types(head, tmp_path):
         {name for name, _ in kinds}, sorted=True)] == [
         (5, -4096, -5), ('abc', 7), (0, '{}', 1), (5, '257', 2), (0, 4095, 127), ('abcdef', 8),
         (9, '"word"', 3), (0, '{}', 4)]
+    import_ctf(to_ctf2(folder), tmp_path / 'ctf2.mcap')
+    assert contents(tmp_path / 'ctf2.mcap') == contents(tmp_path / 'out.mcap')
+
+
+def test_an_array_without_elements_is_aligned(tmp_path):
+    """As babeltrace2 reads it; LTTng aligns the elements of some processors."""
+    wide = 'integer { size = 64; align = 64; }'
+    kinds = [('my:list', [
+        ('given', f'struct {{ integer {{ size = 8; align = 8; }} n; {wide} list[n]; }}',
+         lambda value: value), ('after', 'u8')])]
+    folder = session(tmp_path / 's', kinds, [
+        (0, 10, 1, 1, 'p', bytes(12), 7)], context=False)
+    import_ctf(folder, tmp_path / 'out.mcap')
+    assert [event[4:] for event in TraceReader(tmp_path / 'out.mcap').events({'my:list'})] == [
+        (0, (), 7)]
+
+
+U8 = {'type': 'fixed-length-unsigned-integer', 'length': 8, 'byte-order': 'little-endian',
+      'alignment': 8}
+
+
+def test_types_of_ctf2(tmp_path):
+    """Names of types, structures around, and types that CTF 1.8 does not have."""
+    folder = to_ctf2(session(
+        tmp_path / 's', [('a:b', [('bytes', 'u8[9]')])],
+        [(0, 1, 1, 1, 'p', (1, 2, 3, 4, 5, 6, 7, 8, 9))]))
+
+    def location(*path):
+        return {'path': path}
+
+    def choice(place):
+        return {'type': 'variant', 'selector-field-location': place, 'options': [
+            {'selector-field-ranges': [[7, 9]], 'field-class': {'type': 'structure'}},
+            {'selector-field-ranges': [[0, 0], [1, 3]], 'field-class': 'byte'}]}
+
+    members = [
+        ('n', {**U8, 'type': 'fixed-length-boolean'}), ('size', 'byte'),
+        ('blob', {'type': 'dynamic-length-blob', 'length-field-location': location('size')}),
+        ('nested', {'type': 'structure', 'minimum-alignment': 8, 'member-classes': [
+            {'name': 'size', 'field-class': {**U8, 'type': 'fixed-length-bit-map'}},
+            {'name': 'above', 'field-class': choice(location(None, 'size'))},
+            {'name': 'choice', 'field-class': choice(
+                {'origin': 'event-record-payload', 'path': ['n']})},
+            {'name': 'text', 'field-class': {
+                'type': 'dynamic-length-string', 'length-field-location': location('size')}}]})]
+    kept = [part for part in (folder / 'metadata').read_text().split('\x1e')
+            if part and 'event-record-class"' not in part.partition(',')[0]]
+    added = [{'type': 'field-class-alias', 'name': 'octet', 'field-class': U8},
+             {'type': 'field-class-alias', 'name': 'byte', 'field-class': 'octet'},
+             {'type': 'event-record-class', 'name': 'a:b', 'payload-field-class': {
+                 'type': 'structure', 'member-classes': [
+                     {'name': name, 'field-class': kind} for name, kind in members]}}]
+    (folder / 'metadata').write_text('\x1e' + '\x1e'.join([*kept, *map(json.dumps, added)]))
+    data = (folder / 'channel_0').read_bytes()
+    (folder / 'channel_0').write_bytes(data[:-9] + b'\1\2xy\2\4\5ab')
+    event, = (event for event in read_events(imported(folder, tmp_path))
+              if event['_name'] == 'a:b')
+    assert {name: value for name, value in event.items() if name[0] != '_'} == {
+        'n': 1, 'size': 2, 'blob': (120, 121), 'nested_size': 2, 'nested_above': '4',
+        'nested_choice': '5', 'nested_text': 'ab'}
 
 
 def test_a_damaged_file_is_used_up_to_the_damage(tmp_path):
@@ -236,6 +322,81 @@ def test_hostile_types_are_refused(types, fields, says, tmp_path):
         'uint64_t;\n', 'uint64_t;\ntypealias integer { size = 8; } := uint8_t;\n', 1))
     with pytest.raises(TraceError, match=re.escape(says)):
         import_ctf(folder, tmp_path / 'out.mcap')
+
+
+def ctf2_of(payload, more=()):
+    """Return metadata with an event whose payload has one type, after some more fragments."""
+    text = fragments(METADATA.format(
+        offset=0, boot='', order='le', head='struct { uint32_t id; time_t timestamp; }',
+        context='', environment=''))
+    event = {'type': 'event-record-class', 'name': 'a:b', 'payload-field-class': {
+        'type': 'structure', 'member-classes': [{'name': 'a', 'field-class': payload}]}}
+    return text + ''.join(f'\x1e{json.dumps(each)}' for each in (*more, event))
+
+
+def alias(name, kind):
+    return {'type': 'field-class-alias', 'name': name, 'field-class': kind}
+
+
+DEEP = U8
+for _ in range(30):
+    DEEP = {'type': 'static-length-array', 'length': 1, 'element-field-class': DEEP}
+TWICE = [alias('a0', U8), *(
+    alias(f'a{n + 1}', {'type': 'structure', 'member-classes': [
+        {'name': each, 'field-class': f'a{n}'} for each in 'xy']}) for n in range(40))]
+WIDE = [alias('wide', {'type': 'structure', 'member-classes': [
+    {'name': f'm{n}', 'field-class': U8} for n in range(4000)]}), *(
+    {'type': 'event-record-class', 'id': n + 1, 'payload-field-class': 'wide'}
+    for n in range(2000))]
+
+
+@pytest.mark.parametrize(('payload', 'more', 'says'), [
+    (DEEP, (), 'nested too deep'), ('a40', TWICE, 'nested too deep'),
+    ('a20', TWICE, 'more than 5000 members'), (U8, WIDE, 'more than 131072 types'),
+    ('a', [alias('a', 'b'), alias('b', 'a')], "'a' is no type"),
+    ('missing', (), "there is no type 'missing'"), (7, (), "'7' is no type"),
+    ({**U8, 'length': 65}, (), 'no possible size'), ({**U8, 'length': '8'}, (), 'no integer'),
+    ({**U8, 'length': 2 ** 70}, (), 'no integer'), ({**U8, 'alignment': 7}, (), 'no possible al'),
+    ({**U8, 'bit-order': 'last-to-first'}, (), 'the order of bits'),
+    ({**U8, 'type': 'variable-length-unsigned-integer'}, (), 'is not read'),
+    ({'type': 'null-terminated-string', 'encoding': 'utf-16le'}, (), 'not UTF-8'),
+    ({'type': 'static-length-array', 'length': 2 ** 32 - 1,
+      'element-field-class': {'type': 'structure'}}, (), 'without a size'),
+    ({'type': 'static-length-array', 'length': 2 ** 32 - 1, 'element-field-class': U8}, (),
+     'longer than its event'),
+    ({'type': 'dynamic-length-blob', 'length-field-location': {'path': ['b']}}, (),
+     "no field 'b'"),
+    ({'type': 'dynamic-length-blob', 'length-field-location': {'path': [None, None, 'b']}}, (),
+     "no field 'b'"),
+    ({'type': 'dynamic-length-blob', 'length-field-location': {'path': []}}, (), 'no path'),
+    ({'type': 'variant', 'selector-field-location': {'path': ['b']}, 'options': []}, (),
+     '0 ranges'),
+    (U8, [{'type': 'clock-class', 'id': 'slow', 'frequency': 0}], 'no possible size'),
+    (U8, [{'type': 'trace-class', 'environment': 1}], 'is no object'),
+    (U8, [{'type': 'preamble', 'version': 2}], 'only preamble'),
+    (U8, [{'type': 'data-stream-class'}], 'two streams have the number 0'),
+    (U8, [{'type': 'event-record-class', 'data-stream-class-id': 5}], 'is of no stream'),
+    (U8, [{'type': 'story'}], "the type 'story'"), (U8, [[]], 'is no JSON object')])
+def test_hostile_ctf2_is_refused(payload, more, says, tmp_path):
+    folder = session(
+        tmp_path / 's', [('a:b', [('rest', 'u64')])], [(0, 1, 1, 1, 'p', 2**64 - 1)],
+        context=False)
+    (folder / 'metadata').write_text(ctf2_of(payload, more))
+    with pytest.raises(TraceError, match=re.escape(says)):
+        import_ctf(folder, tmp_path / 'out.mcap')
+
+
+@pytest.mark.parametrize(('text', 'says'), [
+    ('\x1e{"type": "preamble", "version": 3}', 'it is of version 3 of CTF'),
+    ('\x1e{"type": "preamble", "version": 2, "extensions": {"a": {}}}', 'extensions'),
+    ('\x1e{"type": "preamble", "version": 2, "uuid": 99999999999}', 'no UUID'),
+    ('\x1e{"type": "preamble", "version": 2', 'its fragment 1 is cut or no JSON'),
+    ('\x1e{"type": ' + '[' * 200_000, 'nested too deep'),
+    ('\x1e{"type": "trace-class"}', 'only preamble'), ('\x1e', 'is cut or no JSON')])
+def test_ctf2_that_is_cut_is_one_error(text, says, tmp_path):
+    (tmp_path / 'metadata').write_text(text)
+    with pytest.raises(TraceError, match=f'{UNREADABLE}.*{re.escape(says)}'):
+        import_ctf(tmp_path, tmp_path / 'out.mcap')
 
 
 _LINE = re.compile(r'\[(\d+)\.(\d{9})\] \(\S+\) (?:\S+ )?([^ ]+): \{.*?vpid = (\d+), '
