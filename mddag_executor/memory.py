@@ -4,11 +4,16 @@
 
 from __future__ import annotations
 
-import ctypes
+from resource import getrusage, RUSAGE_SELF
+
+_LITTLE_KB = 100_000
 
 
 def give_back() -> None:
-    """Give the system the memory that is free: the C library keeps it where it can."""
+    """Give the system the memory that is free, if it is much: the C library keeps it."""
+    if getrusage(RUSAGE_SELF).ru_maxrss < _LITTLE_KB:
+        return
+    import ctypes
     try:
         ctypes.CDLL(None).malloc_trim(0)
     except (AttributeError, OSError):

@@ -20,13 +20,6 @@ from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import TABLES
-from mddag_executor.results.replays import (
-    RecordedFile,
-    ReplayedDag,
-    ReplayResult,
-    ReplayResultRare,
-)
-from mddag_executor.results.sinks import DagCounts, SinkCounts, SlackTimes
 from mddag_executor.sources.open import Given, open_recording, Progress
 from mddag_executor.text import counted
 from msg_graph import Dag, TaskSet
@@ -34,6 +27,13 @@ from msg_graph.drift import Drift
 
 if TYPE_CHECKING:
     from mddag_executor.analysis.result_table import ResultTable
+    from mddag_executor.results.replays import (
+        RecordedFile,
+        ReplayedDag,
+        ReplayResult,
+        ReplayResultRare,
+    )
+    from mddag_executor.results.sinks import DagCounts, SinkCounts, SlackTimes
 
 
 class Replay:

@@ -50,7 +50,7 @@ from mddag_executor.analysis.spans import Spans
 from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
 from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.columns import rows as table_of
-from mddag_executor.recording.joins import as_of
+from mddag_executor.recording.joins import as_of, distinct
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
@@ -188,7 +188,7 @@ class Never(NamedTuple):
     def waiting(self, vertices: Ints, times: Ints) -> Ints:
         """Return by vertex the job whose execution waited at the given time, or -1."""
         jobs = np.full(len(vertices), -1)
-        for vertex in np.unique(vertices).tolist():
+        for vertex in distinct(vertices).tolist():
             mine = self.started[self.started['vertex'] == vertex]
             mine = mine[mine['ready'].argsort(kind='stable')]
             job, ready, start = mine['job'], mine['ready'], mine['start']
@@ -331,7 +331,7 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     times[:, GROUP] = np.minimum(spans['more'], left)
     left = left - times[:, GROUP]
     if pool.threads is not None:
-        for thread in np.unique(spans['place']).tolist():
+        for thread in distinct(spans['place']).tolist():
             mine = np.flatnonzero(spans['place'] == thread)
             # without an execution its thread is unknown
             times[mine, WAITED] = left[mine] if thread not in pool.threads else np.minimum(
@@ -464,7 +464,7 @@ def behind(
     share = 10 * every['ns'] >= (rows['until'] - rows['release'])[every['miss']]
     chosen = np.flatnonzero(np.isin(every['cause'], _WAITS) & share)
     waits: dict[int, list[tuple[int, int]]] = {}
-    for place in np.unique(every['place'][chosen]).tolist():
+    for place in distinct(every['place'][chosen]).tolist():
         keys = [key for key in runs if key[1] == place]
         callbacks = [callback for callback, _ in keys]
         mine = chosen[every['place'][chosen] == place]
@@ -477,7 +477,7 @@ def behind(
         times[:, waited] = [
             on_workers[key].within(begins[waited], ends[waited]) for key in keys]
         grouped = parts['cause'] == GROUP
-        for vertex in np.unique(parts['vertex'][grouped]).tolist():
+        for vertex in distinct(parts['vertex'][grouped]).tolist():
             others = [i for i, callback in enumerate(callbacks)
                       if group_of.get(vertex, -1) != groups.get(callback, -2)]
             times[np.ix_(others, np.flatnonzero(grouped & (parts['vertex'] == vertex)))] = 0

@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any, cast, NamedTuple
+from typing import Any, cast, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.analysis.deadlines import Judged
 from mddag_executor.core import legs_of, NEVER
@@ -42,10 +42,12 @@ from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
 from mddag_executor.recording.joins import rows_by, sort_by
 from mddag_executor.recording.tables import EXECUTIONS, LEG
-from mddag_executor.results.replays import Breakdown, ChainLink, ResponseParts, WorstJob
 from msg_graph import TaskSet
 from msg_graph.model import topological_order
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import Breakdown, ChainLink, ResponseParts, WorstJob
 
 LINKS = np.dtype([
     ('of', 'i8'), ('vertex', 'i8'), ('leg', 'i8'), ('ready', 'i8'), ('start', 'i8'),
@@ -292,9 +294,9 @@ class Chains:
         links = self._follow(
             dag, np.flatnonzero(known[worst:worst + 1]), np.array([v]), job[worst:worst + 1])
         return {
-            'mean': cast(ResponseParts, {
+            'mean': cast('ResponseParts', {
                 f'{name}_ns': round(int(parts[name].sum()) / len(parts)) for name in PARTS}),
-            'worst': cast(WorstJob, {
+            'worst': cast('WorstJob', {
                 'job': int(parts['job'][worst]), 'release_ns': int(parts['release'][worst]),
                 'completed_ns': int(parts['completed'][worst]),
                 **{f'{name}_ns': int(parts[name][worst]) for name in PARTS},

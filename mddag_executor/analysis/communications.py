@@ -4,11 +4,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from mddag_executor.analysis.spread import spread_of, sum_of
 from mddag_executor.recording.joins import different, rows_by
 from mddag_executor.recording.recording import Recording
-from mddag_executor.results.replays import Communication, RecordedCallback
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import Communication, RecordedCallback
 
 
 def recorded_callbacks(recording: Recording) -> dict[str, RecordedCallback]:

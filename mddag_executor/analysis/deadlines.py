@@ -60,7 +60,7 @@ from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
 from mddag_executor.recording.jobs import Jobs
-from mddag_executor.recording.joins import different, rows_by, sort_by
+from mddag_executor.recording.joins import different, distinct, rows_by, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.text import counted
 from msg_graph.model import optional_edges, topological_order
@@ -437,7 +437,7 @@ class Judged:
         done_leg[cell[number], at] = number
         again = done_leg[cell[number], at] != number
         duplicate[number[again]] = True
-        cells = np.unique(cell[mine])
+        cells = distinct(cell[mine])
         of = done_leg[cells]
         wanted = np.arange(width) < n_legs[cells % n][:, None]
         whole = ((of >= 0) | ~wanted).all(axis=1)

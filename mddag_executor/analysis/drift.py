@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Set
 
-from mddag_executor.recording.joins import different, rows_by
+from mddag_executor.recording.joins import different, distinct, rows_by
 from mddag_executor.recording.mapping import declared_keys
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
@@ -75,7 +75,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         if counts.get(each.number) and each.number in keys:
             came[keys[each.number]] |= {each.start}
     whole = table['vertex'][declared & (table['completes'] == VERTEX)]
-    for vertex in np.unique(whole).tolist():
+    for vertex in distinct(whole).tolist():
         came.pop(vertices[vertex].callback.key, None)   # it got all of them
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
     sent = recording.publications

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.analysis.causes import (
     behind,
@@ -45,19 +45,21 @@ from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.columns import concatenate, in_parts, Ints, Mask, rows, Table
-from mddag_executor.recording.joins import different, rows_by, sort_by
+from mddag_executor.recording.joins import different, distinct, rows_by, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
-from mddag_executor.results.replays import (
-    ExplainResult,
-    ExplainResultRare,
-    LatePath,
-    MissedJob,
-    Misses,
-    MissPart,
-)
 from msg_graph.model import topological_order
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import (
+        ExplainResult,
+        ExplainResultRare,
+        LatePath,
+        MissedJob,
+        Misses,
+        MissPart,
+    )
 
 _NO_END = 2 ** 62
 _STEPS = 32     # per octave
@@ -117,7 +119,7 @@ class Explanation:
         missed['demoted'] = [demoted.get(key, _NO_END) for key in zip(
             missed['sink'].tolist(), missed['job'].tolist())]
         links: list[Table] = []
-        for dag in np.unique(verdicts['dag']).tolist():
+        for dag in distinct(verdicts['dag']).tolist():
             mine = np.flatnonzero(verdicts['dag'] == dag)
             at, of_dag = chains.of_misses(dag, verdicts[mine])
             missed['at'][mine] = at
@@ -145,7 +147,7 @@ class Explanation:
         of_vertex[table['vertex'][rows]] = self._place[rows]
         threads = {
             thread: Spans(*crowded(table['start'][each], table['end'][each], 1))
-            for thread in np.unique(self._place[rows]).tolist()
+            for thread in distinct(self._place[rows]).tolist()
             for each in [rows[self._place[rows] == thread]]
         } if self._recording.run.imported else None
         return Pool(
@@ -318,7 +320,7 @@ class Explanation:
         runs, on_workers = {}, {}
         for callback, at in zip(callbacks.tolist(), rows_by(which, len(callbacks))):
             places = self._place[rows[at]]
-            for place in np.unique(places).tolist():
+            for place in distinct(places).tolist():
                 mine = rows[at[places == place]]
                 runs[callback, place], on_workers[callback, place] = (
                     Spans(table['start'][each], table['end'][each])

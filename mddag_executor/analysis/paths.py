@@ -53,13 +53,14 @@ documentation of its response time cases.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, cast, NamedTuple
+from typing import Any, cast, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.analysis.spread import spread
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
 from mddag_executor.recording.joins import (
     as_of,
     different,
+    distinct,
     equal,
     last_before,
     last_of,
@@ -69,10 +70,12 @@ from mddag_executor.recording.joins import (
 )
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import EXECUTIONS
-from mddag_executor.results.replays import PathResult, PathTimes, ResponseCases
 from msg_graph import Callback, Path
 from msg_graph.segments import hops, may_end
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import PathResult, PathTimes, ResponseCases
 
 NONE = -1
 _NEVER = 2 ** 62
@@ -335,7 +338,7 @@ class Paths:
             return [self._table['message'][ran.runs]]
         found: list[Ints] = []
         vertices = self._task_set.vertices
-        for v in np.unique(ran.vertex).tolist():
+        for v in distinct(ran.vertex).tolist():
             mine = ran.vertex == v
             for local in vertices[v].predecessors:
                 publisher = v - vertices[v].index + local
@@ -502,7 +505,7 @@ def figures(start: Ints, end: Ints) -> PathTimes:
     """
     times = {name: spread(each) for name, each in cases(start, end).items()}
     return {
-        'response_time': cast(ResponseCases, {name: times[name] for name in _CASES}),
+        'response_time': cast('ResponseCases', {name: times[name] for name in _CASES}),
         'reaction_time': times['worst_with_external_latency'], 'data_age': times['data_age']}
 
 

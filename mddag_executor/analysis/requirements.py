@@ -10,6 +10,7 @@ The rules are those of ``core.requirements``, applied to all flows of a path at 
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from mddag_executor.analysis.paths import Flows, NONE, Paths
 from mddag_executor.core import NEVER
@@ -18,10 +19,12 @@ from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
 from mddag_executor.recording.joins import sort_by
 from mddag_executor.recording.recording import Recording
-from mddag_executor.results.replays import LatePart, LatePath
-from mddag_executor.results.sinks import Requirements as Results
 from msg_graph import Path
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import LatePart, LatePath
+    from mddag_executor.results.sinks import Requirements as Results
 
 RESULTS = np.dtype([
     ('kind', 'i1'), ('since', 'i8'), ('end', 'i8'), ('step', 'i8'), ('count', 'i8')])

@@ -4,10 +4,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from mddag_executor.core import quantile
 from mddag_executor.recording.columns import Ints
-from mddag_executor.results.replays import Spread
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import Spread
 
 
 def spread(times: Ints) -> Spread | None:

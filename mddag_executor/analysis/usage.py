@@ -17,7 +17,7 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, cast
+from typing import Any, cast, TYPE_CHECKING
 
 from mddag_executor.analysis.spans import Spans
 from mddag_executor.recording.columns import in_parts, Ints, Table
@@ -25,8 +25,10 @@ from mddag_executor.recording.columns import rows as table_of
 from mddag_executor.recording.joins import different, later_pieces, rows_by, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import NOTHING, UNKNOWN
-from mddag_executor.results.replays import CallbackUse, OverTime, WorkerUse
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import CallbackUse, OverTime, WorkerUse
 
 _ALWAYS = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
            'waiting_group_ns')
@@ -241,7 +243,7 @@ class Usage:
 
     def _result(self, place: int) -> CallbackUse:
         names = (*_ALWAYS, *_MEASURED) if self.table['measured'][place] else _ALWAYS
-        return cast(CallbackUse, {name: int(self.table[name][place]) for name in names})
+        return cast('CallbackUse', {name: int(self.table[name][place]) for name in names})
 
     def workers(self, count: int) -> WorkerUse:
         """Return how busy the workers were; ``lent`` is the time of blocking calls."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-import json
 import os
 from pathlib import Path
 import sys
@@ -221,6 +220,7 @@ def write_text(path: str, text: str) -> None:
 
 def write_json(path: str, value: Any) -> None:
     """Write a result for machines as a whole, or to standard output for `-`."""
+    import json
     encoder = json.JSONEncoder(indent=2, allow_nan=False, default=_plain)
     with output_file(path) as file:
         file.writelines(part.encode() for part in encoder.iterencode(value))

@@ -41,6 +41,8 @@ EXIT_SIGNAL = 128
 """A shell adds the number of the signal."""
 
 
+# The verbs that run nodes of the user, who may need these threads.
+_HOSTS = {'mddag run', 'mddag rerun', 'mddag demo'}
 _FAMILIES = {verb.split()[0] for verb in VERBS if ' ' in verb}
 # What a ROS installation brings; pip leaves it out unless asked for the extra `ros`.
 _ROS = ('rclpy', 'std_msgs', 'rcl_interfaces', 'diagnostic_msgs', 'ament_index_python')
@@ -88,6 +90,9 @@ def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
 def run(argv: Sequence[str]) -> int:
     """Parse and do what a command line says; return the verb's exit status."""
     parser, rest = find_verb(argv)
+    if parser.prog not in _HOSTS:
+        # Each thread that OpenBLAS makes spins for a while, and nothing here multiplies matrices.
+        os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     args = parser.parse(rest)
     set_quiet(args.quiet)
     from mddag_executor.cli.common import check_files

@@ -26,15 +26,17 @@ Results are in a row by inputs or outputs, which counts for ``tolerate``.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_NOT_DUE
 from mddag_executor.core.tally import counts, is_kept, SinkTally
 from mddag_executor.core.weakly_hard import MissWindow
-from mddag_executor.results.sinks import SinkCounts
 from mddag_executor.text import counted
 from msg_graph import format_duration, Path, TaskSet
 from msg_graph.segments import may_end, segments
+
+if TYPE_CHECKING:
+    from mddag_executor.results.sinks import SinkCounts
 
 
 class Rules:

@@ -15,9 +15,11 @@ Stops: times in which no thread of the process ran, and the misses that they exp
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
-from mddag_executor.results.runs import Stops as StopsResult
+if TYPE_CHECKING:
+    from mddag_executor.results.runs import Stops as StopsResult
+
 
 LEAST_NS = 20_000_000
 """A shorter time is no stop, ns."""

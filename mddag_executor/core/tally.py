@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, cast, NamedTuple
+from typing import Any, cast, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.state import (
@@ -38,16 +38,18 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import NEVER, Tables
 from mddag_executor.core.weakly_hard import MissWindow
-from mddag_executor.results.sinks import (
-    DagCounts,
-    FirstMiss,
-    JobEnds,
-    ResponseTimes,
-    SinkCounts,
-    SinkVerdicts,
-    Verdicts,
-)
 from msg_graph import Dag, TaskSet, Vertex, WeaklyHard
+
+if TYPE_CHECKING:
+    from mddag_executor.results.sinks import (
+        DagCounts,
+        FirstMiss,
+        JobEnds,
+        ResponseTimes,
+        SinkCounts,
+        SinkVerdicts,
+        Verdicts,
+    )
 
 VERDICTS = {
     SINK_IN_TIME: 'in_time', SINK_LATE: 'late', SINK_MISSED: 'overdue', SINK_EXPIRED: 'expired',
@@ -201,7 +203,7 @@ class SinkTally:
             response = {
                 'min': self.shortest, 'median': quantile(ordered, 0.5),
                 'p99': quantile(ordered, 0.99), 'max': self.longest}
-        return cast(SinkCounts, {
+        return cast('SinkCounts', {
             'relative_deadline_ns': self.relative_deadline_ns, **self.verdicts(),
             'response_ns': response})
 
@@ -347,7 +349,7 @@ class Tally:
         for dag in self._dags:
             dags[dag.name] = {
                 'jobs': self.jobs[dag.index],
-                'ends': cast(JobEnds, {
+                'ends': cast('JobEnds', {
                     OUTCOMES[e]: n for e, n in self.ends[dag.index].items()
                     if n or e != ABORTED}),
                 'sinks': {self.vertex_name(v): self._sink_result(v)

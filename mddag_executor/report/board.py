@@ -12,10 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 import time
-from typing import Any, cast, NamedTuple
+from typing import Any, cast, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.report.text import format_ns, printable, table
-from mddag_executor.results.comparisons import TopResult, TopSink
+
+if TYPE_CHECKING:
+    from mddag_executor.results.comparisons import TopResult, TopSink
 
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 GONE = 'GONE'
@@ -97,7 +99,7 @@ class Sink(NamedTuple):
 
     def result(self) -> TopSink:
         """Return the sink for JSON."""
-        return cast(TopSink, {
+        return cast('TopSink', {
             'process': self.process, 'dag': self.dag, 'sink': self.sink, 'level': self.level,
             'wrong': self.wrong, **{key: _number(self.values.get(key)) for key in (
                 'window_results', 'in_time_ratio', 'response_p99_ms', 'deadline_ms',

@@ -11,7 +11,7 @@ due in contrast to the first run or, with a tolerance, if its p99 response time 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core.requirements import as_dags
 from mddag_executor.core.tally import Counts, counts, total
@@ -23,21 +23,23 @@ from mddag_executor.report.tables import (
     with_means,
 )
 from mddag_executor.report.text import Cell, format_ns, printable, table
-from mddag_executor.results.comparisons import (
-    CallbackSide,
-    ComparedCallback,
-    ComparedDag,
-    ComparedRun,
-    ComparedSink,
-    DiffResult,
-    DiffResultRare,
-    SinkSide,
-    TimesChange,
-    VerdictCounts,
-)
-from mddag_executor.results.replays import CallbackUse
-from mddag_executor.results.sinks import ResponseTimes
 from mddag_executor.text import counted
+
+if TYPE_CHECKING:
+    from mddag_executor.results.comparisons import (
+        CallbackSide,
+        ComparedCallback,
+        ComparedDag,
+        ComparedRun,
+        ComparedSink,
+        DiffResult,
+        DiffResultRare,
+        SinkSide,
+        TimesChange,
+        VerdictCounts,
+    )
+    from mddag_executor.results.replays import CallbackUse
+    from mddag_executor.results.sinks import ResponseTimes
 
 _HEADER = (
     'sink', 'due A', 'due B', 'in time A', 'in time B', 'p99 A', 'p99 B', 'p99 B-A', '')

@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.analysis.causes import REMEDIES
 from mddag_executor.report.tables import percent, short_names
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
-from mddag_executor.results.replays import Stall
 from mddag_executor.text import counted
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import Stall
 
 MOST_STALLS = 10
 

@@ -6,16 +6,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core.state import Decision
 from mddag_executor.errors import UsageError
-from mddag_executor.results.simulations import SimulatedRunRare, SimulatedRunResult
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.pool import LogEntry
 from mddag_executor.simulate.schedule import schedule, Settings
 from msg_graph import TaskSet
 from msg_graph.model import MOST_WORKERS
+
+if TYPE_CHECKING:
+    from mddag_executor.results.simulations import SimulatedRunRare, SimulatedRunResult
 
 JUDGES = ('horizon', 'completions')
 

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from functools import cached_property
 
 from mddag_executor.recording.columns import Ints, Mask
-from mddag_executor.recording.joins import different
+from mddag_executor.recording.joins import different, distinct
 from mddag_executor.sources import clocks
 from mddag_executor.sources.links import Links
 from mddag_executor.text import counted, listed
@@ -125,7 +125,7 @@ class ImportedClocks:
         """Return the nodes of a machine, or its processes if they are unknown."""
         links = self._links
         runs = links.runs['callback'][np.array(self._machine)[self._receives] == machine]
-        callbacks = [links.callbacks[each] for each in np.unique(runs).tolist()]
+        callbacks = [links.callbacks[each] for each in distinct(runs).tolist()]
         names = dict.fromkeys(each.node.name for each in callbacks if each.node is not None)
         pids = [pid for pid, of in zip(self._pids, self._machine) if of == machine]
         return listed(list(names), 3) or f'process {listed([str(pid) for pid in pids], 3)}'

@@ -32,7 +32,7 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER
 from mddag_executor.memory import give_back
 from mddag_executor.recording.columns import Ints, Mask, rows, Table
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.joins import different, earliest, groups, sort_by
+from mddag_executor.recording.joins import different, distinct, earliest, groups, sort_by
 from mddag_executor.recording.losses import Loss, Losses
 from mddag_executor.recording.mapping import Matching
 from mddag_executor.recording.recording import Recording
@@ -95,7 +95,7 @@ class ImportedRun:
             self._events = moved(self._events, self._clocks.shift)
             self._link()
             starts = self._starts()
-        threads = {self._events.threads[each] for each in np.unique(starts['thread']).tolist()}
+        threads = {self._events.threads[each] for each in distinct(starts['thread']).tolist()}
         # The policy of another executor is not recorded; its name replaces the pool.
         self.head = head or Head(
             int(starts['time'][0]), '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
@@ -193,9 +193,9 @@ class ImportedRun:
         pids = np.array([pid for pid, _ in self._events.threads], dtype=np.int64)[runs['thread']]
         declared = [each.number in self._vertex for each in self.links.callbacks]
         known = np.array(declared, dtype=np.bool_)[runs['callback']]
-        self._pids = list(dict.fromkeys([*np.unique(pids[known]).tolist(),
-                                         *np.unique(pids).tolist()]))
-        self._n_declared = len(np.unique(pids[known]))
+        self._pids = list(dict.fromkeys([*distinct(pids[known]).tolist(),
+                                         *distinct(pids).tolist()]))
+        self._n_declared = len(distinct(pids[known]))
         if not self._imported:
             return np.zeros(len(runs), dtype=np.int64)
         order = np.argsort(self._pids)

@@ -44,7 +44,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from mddag_executor.recording.columns import Ints, Mask, rows, Table
-from mddag_executor.recording.joins import as_of, different, equal_pairs, last_of, sort_by
+from mddag_executor.recording.joins import (
+    as_of,
+    different,
+    distinct,
+    equal_pairs,
+    last_of,
+    sort_by,
+)
 from mddag_executor.recording.losses import Kind, Loss
 from mddag_executor.sources.entities import Addresses, Entities
 from mddag_executor.sources.imported_events import (
@@ -200,7 +207,7 @@ class Links:
         at = np.flatnonzero(events)
         table = self.events
         pid, address = self._pid[table['thread'][at]], table['a'][at]
-        processes, addresses = np.unique(pid), np.unique(address)
+        processes, addresses = distinct(pid), distinct(address)
         key = np.searchsorted(processes, pid) * max(1, len(addresses)) + np.searchsorted(
             addresses, address)
         order = sort_by(key)
@@ -214,7 +221,7 @@ class Links:
             times = table['time'][at[group]]
             since = np.array(known.times(*where), dtype=np.int64)
             piece = np.maximum(0, as_of(since, times))
-            for number in np.unique(piece).tolist():
+            for number in distinct(piece).tolist():
                 thing = find(*where, int(since[number]) if len(since) else int(times[0]))
                 if thing is None:
                     continue

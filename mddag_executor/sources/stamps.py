@@ -24,6 +24,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from mddag_executor.recording.columns import Ints
+from mddag_executor.recording.joins import distinct
 from mddag_executor.sources.stamps_without_numbers import (
     BeingSent,
     find_in_order,
@@ -91,7 +92,7 @@ class _Numbers:
         self._known: dict[int, tuple[Ints, Ints]] = {}
         messages = np.flatnonzero(which >= 0)
         of = publisher[which[messages]]
-        for each in np.unique(publisher).tolist():
+        for each in distinct(publisher).tolist():
             mine, some = np.flatnonzero(publisher == each), messages[of == each]
             self._place[mine] = np.arange(len(mine))
             some = some[np.argsort(numbers[some], kind='stable')]

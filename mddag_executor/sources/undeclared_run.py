@@ -33,7 +33,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from mddag_executor.recording.columns import Ints, Mask, rows, Table
-from mddag_executor.recording.joins import as_of, equal_pairs, rows_by, sort_by
+from mddag_executor.recording.joins import as_of, distinct, equal_pairs, rows_by, sort_by
 from mddag_executor.recording.losses import Loss
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, UNKNOWN
@@ -191,7 +191,7 @@ class UndeclaredRun(ImportedRun):
         due = self.links.runs['due']
         for callback, mine in zip(
                 self.links.callbacks, rows_by(number, len(self.links.callbacks))):
-            times = np.unique(ready[mine[due[mine] == 0]])
+            times = distinct(ready[mine[due[mine] == 0]])
             if callback.kind == 'timer' and len(times):
                 callback.grid = _grid(times, callback.period)
             if callback.kind == 'timer':
@@ -234,7 +234,7 @@ def _grid(ready: Ints, period: int) -> int | None:
     if not 0 < period < NEVER:
         return None
     phase = (ready - ready[0]) % period
-    origins = np.unique(phase)
+    origins = distinct(phase)
     n = len(origins)
     # an origin in (the later moment, the earlier one] is excluded
     close = np.flatnonzero(np.diff(ready) < period)

@@ -27,12 +27,10 @@ import struct
 from typing import BinaryIO, NamedTuple
 import zlib
 
-import lz4.frame
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Header, Statistics
 from mddag_executor.trace import records
 from mddag_executor.trace.errors import TraceError
+from mddag_executor.trace.records import Channel, Content, counts_of, library_of
 import zstandard
 
 MAX_CHUNK = 256 * 1024 * 1024
@@ -49,6 +47,7 @@ _SUMMARY = (*_USED, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA
 _PRIVATE = 0x80     # opcodes from here on belong to others
 _CHUNK_HEAD = 256   # bytes; the name of the compression is short
 _CRC_PIECE = 1 << 20
+_NUMBER = 2         # bytes of the number of a schema or channel, which comes first
 _FOOTER_SIZE = records.RECORD.size + records.FOOTER_CONTENT.size + len(records.MAGIC)
 _REMEDY = 'give a trace written by this program or another MCAP recording'
 
@@ -60,25 +59,6 @@ class Damage(Exception):
         super().__init__(what)
         self.what = what
         self.offset = offset
-
-
-class Content(ReadDataStream):
-    """
-    The content of a record, for mcap's readers.
-
-    Reading past the end raises ValueError, so wrong lengths are harmless.
-    """
-
-    def __init__(self, data: bytes) -> None:
-        super().__init__(BytesIO(data))
-        self._size = len(data)
-
-    def read(self, length: int) -> bytes:
-        """Return the next bytes."""
-        self._count += length
-        if self._count > self._size:
-            raise ValueError('a record is shorter than what it should hold')
-        return self._stream.read(length)
 
 
 class ChunkHead(NamedTuple):
@@ -192,13 +172,13 @@ def open_data(stream: BinaryIO, path: str, size: int) -> tuple[int, str]:
         opcode, length = records.RECORD.unpack(head)
         content = Content(stream.read(min(length, 1 << 16)))
         try:
-            library: str = Header.read(content).library
+            library = library_of(content)
         except ValueError:
             opcode = 0
         end = len(records.MAGIC) + len(head) + int(length)
         # A wrong length could skip the first chunk.
         if opcode == Opcode.HEADER and (
-                content.count == length or _is_record(stream, end, size)):
+                content.at == length or _is_record(stream, end, size)):
             return end, library
     raise TraceError(path, 'ends or is damaged before its first event', _REMEDY)
 
@@ -301,14 +281,13 @@ def _chunk(file: int, offset: int, content: bytes) -> ChunkHead:
     begin = offset + records.RECORD.size
     try:
         start, end, size, crc = fixed.unpack(stream.read(fixed.size))
-        compression = stream.read(stream.read4()).decode()
-        length = stream.read8()
+        compression, length = stream.text(), stream.number(8)
     except ValueError as error:
         raise Damage(str(error), offset) from None
     record, = struct.unpack('<Q', os.pread(file, 8, offset + 1))
-    if stream.count + length > record or size > MAX_CHUNK:
+    if stream.at + length > record or size > MAX_CHUNK:
         raise Damage('the lengths in the head of a chunk are wrong', offset)
-    return ChunkHead(start, end, size, crc, compression, file, begin + stream.count, length)
+    return ChunkHead(start, end, size, crc, compression, file, begin + stream.at, length)
 
 
 def _decompress(data: bytes, compression: str, room: memoryview) -> None:
@@ -324,6 +303,7 @@ def _decompress(data: bytes, compression: str, room: memoryview) -> None:
         with zstandard.ZstdDecompressor().stream_reader(data) as reader:
             filled = reader.readinto(room) + len(reader.read(1))
     elif compression == 'lz4':
+        import lz4.frame
         stream = lz4.frame.open(BytesIO(data))
         filled = 0
         while piece := stream.read(_LZ4_PIECE):     # one large read takes thrice the memory
@@ -364,10 +344,11 @@ def read_summary(stream: BinaryIO, size: int) -> Summary | None:
     statistics = found.get(Opcode.STATISTICS)
     if statistics is None:
         return None
-    counts, channels = Statistics.read(Content(statistics[-1])), found.get(Opcode.CHANNEL, [])
+    messages, chunks = counts_of(Content(statistics[-1]))
+    channels = found.get(Opcode.CHANNEL, [])
+    topics = (Channel.read(Content(each[_NUMBER:])).topic for each in channels)
     return Summary(
-        counts.message_count, counts.chunk_count,
-        frozenset(Channel.read(Content(each)).topic for each in channels),
+        messages, chunks, frozenset(topics),
         tuple(found.get(Opcode.SCHEMA, [])), tuple(channels))
 
 

@@ -24,11 +24,10 @@ import re
 import struct
 from typing import NamedTuple, TypeVar
 
-from mcap.records import Channel, Schema
 from mddag_executor.trace import cdr
-from mddag_executor.trace.blocks import Content
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.events import Event, Fixed
+from mddag_executor.trace.records import Channel, Content, Schema
 from mddag_executor.trace.schema import EVENTS, PREAMBLE
 import numpy as np
 
@@ -36,7 +35,7 @@ Decoder = tuple[Event, Callable[[bytes], Event]]
 
 UNDEFINED = 'the channel is not defined'
 _TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
-_NO_SCHEMA = Schema(0, b'', '', '')
+_NO_SCHEMA = Schema('', '', b'')
 _T = TypeVar('_T', Channel, Schema)
 DEFINITIONS_LIMIT = 64 * 1024 * 1024        # bytes of all schemas and channels
 
@@ -91,24 +90,23 @@ class Channels:
         """Add the content of a schema record; ValueError: malformed, or redefines a known one."""
         if content in self._known_schemas:      # most files repeat them in each chunk
             return
-        schema = Schema.read(Content(content))
-        self._keep(self._schemas, schema, content)
+        body = Content(content)
+        self._keep(self._schemas, body.number(2), Schema.read(body), content)
         self._known_schemas.add(content)
 
     def add_channel(self, content: bytes) -> None:
         """Add the content of a channel record; ValueError: malformed, or redefines a known one."""
         if content in self._known_channels:
             return
-        channel = Channel.read(Content(content))
-        channel.metadata.clear()        # such as QoS: no message is read in another way by it
-        self._keep(self._channels, channel, content)
+        body = Content(content)
+        number, channel = body.number(2), Channel.read(body)
+        self._keep(self._channels, number, channel, content)
         self._known_channels.add(content)
-        number = channel.id
         if number in self.topics:
             return
-        schema = self._schemas.get(channel.schema_id, _NO_SCHEMA)
+        schema = self._schemas.get(channel.schema, _NO_SCHEMA)
         topic = self.topics[number] = Topic(
-            channel.topic, channel.message_encoding, schema.name, schema.encoding,
+            channel.topic, channel.encoding, schema.name, schema.encoding,
             schema.data.decode(errors='replace'))
         match = _TOPIC.fullmatch(topic.name)
         name = f'{match[1]}:{match[2]}' if match else ''
@@ -136,8 +134,8 @@ class Channels:
             raise ValueError(decoder)
         return decoder
 
-    def _keep(self, kept: dict[int, _T], record: _T, content: bytes) -> None:
-        if kept.setdefault(int.from_bytes(content[:2], 'little'), record) != record:
+    def _keep(self, kept: dict[int, _T], number: int, record: _T, content: bytes) -> None:
+        if kept.setdefault(number, record) != record:
             raise ValueError('a schema or channel changes its meaning')
         self._size += len(content)
         if self._size > DEFINITIONS_LIMIT:

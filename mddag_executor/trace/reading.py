@@ -156,7 +156,7 @@ class Reading:
             self._undecoded.update(
                 f'channel {channel}: {UNDEFINED}' for channel in undefined.tolist())
             found = []
-            for channel in np.unique(channels).tolist():
+            for channel in np.flatnonzero(np.bincount(channels)).tolist():
                 if channel in known and known[channel].name in topics:
                     mine = np.flatnonzero(channels == channel)
                     found.append(Messages(

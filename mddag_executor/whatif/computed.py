@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.analysis.paths import Paths
 from mddag_executor.analysis.requirements import Requirements
@@ -37,17 +37,19 @@ from mddag_executor.recording import tables
 from mddag_executor.recording.columns import Ints, Table
 from mddag_executor.recording.columns import rows as table_of
 from mddag_executor.recording.head import Head
-from mddag_executor.recording.joins import earliest, equal, sort_by
+from mddag_executor.recording.joins import distinct, earliest, equal, sort_by
 from mddag_executor.recording.names import Names
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import UNKNOWN
-from mddag_executor.results.replays import PathsResult
 from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
 from mddag_executor.simulate.load import edge_numbers, FAILS
 from mddag_executor.sources.executions import Numbering
 from msg_graph import TaskSet
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import PathsResult
 
 _DROPS = -1, EXPIRED      # ends of jobs, in the order of the drop reasons
 _REASONS = {EXPIRED: tables.EXPIRED, OUTDATED: tables.OUTDATED}
@@ -332,7 +334,7 @@ class _Tables:
         for place, ((before, after), edge) in enumerate(edge_numbers(tables).items()):
             if tables.is_optional[place]:
                 dag = tables.dag_of[before]
-                jobs = np.unique(load.jobs[load.dags == dag])
+                jobs = distinct(load.jobs[load.dags == dag])
                 delays = load.delays[
                     load.delay_base[dag] + jobs * load.delay_stride[dag] + edge]
                 silent = jobs[delays >= NEVER]

@@ -50,7 +50,7 @@ from mddag_executor.analysis.usage import ran
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.recording import tables as recorded_tables
 from mddag_executor.recording.columns import Ints
-from mddag_executor.recording.joins import as_of, sort_by
+from mddag_executor.recording.joins import as_of, distinct, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.simulate import Load
 from mddag_executor.simulate.deliveries import DELAY_NS
@@ -298,7 +298,7 @@ class LoadBuilder:
         source = ended & ~known
         place = self._places(_JOB, row[source], vertex[source])
         columns['noticed'][place] = np.maximum(ready[source], columns['release'][place])
-        for v in np.unique(vertex[every_leg]).tolist():
+        for v in distinct(vertex[every_leg]).tolist():
             self._split_legs(self._tables.dag_of[v], row[every_leg & (vertex == v)],
                              self._edges_into[v])
 
@@ -341,10 +341,10 @@ class LoadBuilder:
         row, vertex_of, publisher = row[known], vertex_of[known], publisher[known]
         publishers = self._recording.names.publishers
         found = np.zeros(len(self._columns['sent']), dtype=np.uint8)
-        for number in np.unique(publisher).tolist():
+        for number in distinct(publisher).tolist():
             name = publishers[number].topic if number in publishers else None
             mine = publisher == number
-            for v in np.unique(vertex_of[mine]).tolist():
+            for v in distinct(vertex_of[mine]).tolist():
                 places = self._places(_EDGE, row[mine & (vertex_of == v)], v)
                 for edge, bit in edges_from.get((v, name), ()):
                     found[places + edge] |= bit
@@ -495,7 +495,7 @@ class LoadBuilder:
         process = np.concatenate([np.empty(0, dtype=np.int64), *(
             np.tile(self._process[first:after], len(jobs))
             for first, after, jobs in zip(self._first, self._first[1:], self._numbers))])[holds]
-        for number in np.unique(process).tolist():
+        for number in distinct(process).tolist():
             mine = holds[process == number]
             shared = Spans(*crowded(start[mine], end[mine], 2)).within(start[mine], end[mine])
             took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)

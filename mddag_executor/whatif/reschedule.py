@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from mddag_executor.analysis.as_recorded import recording_result, Replay
 from mddag_executor.analysis.usage import share
@@ -24,13 +24,6 @@ from mddag_executor.memory import give_back
 from mddag_executor.recording.head import Head, ReplayError
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import UNKNOWN
-from mddag_executor.results.replays import (
-    PathsResult,
-    RecordedRun,
-    RecordedRunRare,
-    RescheduleResult,
-    RescheduleResultRare,
-)
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.load import SKIPPED
 from mddag_executor.simulate.policies import ALL_POLICIES, preempts, ROS2
@@ -42,6 +35,15 @@ from mddag_executor.whatif.load import LoadBuilder, RecordedLoad
 from msg_graph import EMPTY_TASK_SET, Process, TaskSet
 from msg_graph.derive import gc_paused
 from msg_graph.model import MOST_WORKERS
+
+if TYPE_CHECKING:
+    from mddag_executor.results.replays import (
+        PathsResult,
+        RecordedRun,
+        RecordedRunRare,
+        RescheduleResult,
+        RescheduleResultRare,
+    )
 
 
 class Reschedule:
@@ -111,7 +113,13 @@ class Reschedule:
         if miss is not None:
             dag = self.task_set.dag(miss['dag']).index
             miss = {**miss, 'job': work.jobs[dag][miss['job']]}
-        cpus, processes, skips, notes = (RescheduleResultRare() for _ in range(4))
+        cpus: RescheduleResultRare = {}
+        processes: RescheduleResultRare = {}
+        skips: RescheduleResultRare = {}
+        notes: RescheduleResultRare = {}
+        required: PathsResult = {}
+        if self._requires:
+            required = self.computed().requirements()
         if settings.cpus is not None:
             cpus['cpus'] = settings.cpus
         if self.processes:
@@ -135,7 +143,7 @@ class Reschedule:
                 'busy_ns': {str(w): took for w, took in enumerate(self.busy)},
                 'use': share(sum(self.busy), self.workers, self._scheduled_ns)},
             'recorded': self._recorded_result(),
-            **(self.computed().requirements() if self._requires else PathsResult()),
+            **required,
             'recording': recording_result(self._run), **notes, 'warnings': self.warnings}
 
     def _recorded_result(self) -> RecordedRun | None:

@@ -36,26 +36,28 @@ import math
 import multiprocessing
 import signal
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.analysis.as_recorded import slack as margin
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.requirements import as_dags
 from mddag_executor.core.state import Decision, SINK_IN_TIME
-from mddag_executor.results.simulations import (
-    FewerResult,
-    SinkMargin,
-    SlackFactor,
-    SlackResult,
-)
-from mddag_executor.results.sinks import DagCounts, Requirements, SinkCounts
 from mddag_executor.simulate import Load, schedule, Settings
 from mddag_executor.simulate.load import as_arrays
 from mddag_executor.simulate.schedule import prepare
 from msg_graph import TaskSet
 from msg_graph.derive import gc_paused
 import numpy as np
+
+if TYPE_CHECKING:
+    from mddag_executor.results.simulations import (
+        FewerResult,
+        SinkMargin,
+        SlackFactor,
+        SlackResult,
+    )
+    from mddag_executor.results.sinks import DagCounts, Requirements, SinkCounts
 
 MOST, LEAST = 100.0, 0.01
 EXACT = 1.01
