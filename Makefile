@@ -34,8 +34,8 @@ help:
 	@echo 'make fuzz       read damaged recordings for FUZZ_SECONDS (600) each'
 	@echo 'make lint       run the linters and mypy only'
 	@echo 'make docs       build the documentation, build/docs/index.html'
-	@echo 'make env        make or refresh the environment in $(VENV)/ (the others do it, too)'
-	@echo 'make clean      remove what builds and tests left behind'
+	@echo 'make env        make or refresh the environment in $(VENV)/, as the others also do'
+	@echo 'make clean      remove what builds and tests have written'
 	@echo 'make distclean  the same, and the environment'
 
 env:
@@ -56,6 +56,7 @@ LIVE_TESTS := test/executor test/hosting test/synthetic test/rerun test/examples
 # With another rclpy than the index has: RCLPY is a folder with its package rclpy/, the extension
 # compiled against the headers of ros-jazzy-rclpy (in another environment: .ci/slim removes them).
 test-jazzy: env
+	@sh .ci/tools install
 ifneq ($(wildcard $(RCLPY)/rclpy/__init__.py),)
 	@PYTHONPATH='$(abspath $(RCLPY))' $(BIN)/python -m pytest $(PYTEST_ARGS) $(LIVE_TESTS)
 else
@@ -74,6 +75,7 @@ else
 endif
 
 test-kilted:
+	@sh .ci/tools install
 	@PYTHON='$(PYTHON)' sh .ci/environment $(KILTED) ros-kilted,test-kilted
 	@$(KILTED)/bin/python -m pytest $(PYTEST_ARGS) $(LIVE_TESTS)
 

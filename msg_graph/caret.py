@@ -72,7 +72,7 @@ def _node(tree: Plain) -> DraftNode:
         _group(node, each)
     for each in tree.get('subscribes') or ():
         if each['callback_name'] not in node.callbacks:
-            node.taken.append(TOPIC.check(each['topic_name']))
+            node.polled_topics.append(TOPIC.check(each['topic_name']))
     for each in tree.get('publishes') or ():
         _publisher(node, each)
     for each in tree.get('variable_passings') or ():
@@ -124,7 +124,7 @@ def _publisher(node: DraftNode, tree: Plain) -> None:
             callback.publishes.append(topic)
     if not known:
         for callback in node.callbacks.values():
-            callback.maybe.append(topic)
+            callback.possible_topics.append(topic)
 
 
 def _context(node: DraftNode, tree: Plain) -> None:
@@ -132,11 +132,11 @@ def _context(node: DraftNode, tree: Plain) -> None:
         return
     taken, published = tree['subscription_topic_name'], tree['publisher_topic_name']
     for callback in node.callbacks.values():
-        if published not in callback.publishes or taken in callback.starts:
+        if published not in callback.publishes or taken in callback.started_by:
             continue
         takers = [c.name for c in node.callbacks.values()
-                  if c.kind == 'subscription' and taken in c.starts]
-        for read in takers or ([taken] if taken in node.taken else []):
+                  if c.kind == 'subscription' and taken in c.started_by]
+        for read in takers or ([taken] if taken in node.polled_topics else []):
             _read(callback, read)
 
 

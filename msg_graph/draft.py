@@ -50,20 +50,20 @@ class DraftCallback:
     A callback.
 
     :ivar kind: ``timer``, ``subscription``, ``sync`` or ``service``.
-    :ivar starts: the topics that start it, or its service; empty for a timer.
+    :ivar started_by: the topics that start it, or its service; empty for a timer.
     :ivar period_ns: its timer's period, None if the timer is only assumed; of another source its
         period, if known.
     :ivar publishes: topics that it certainly publishes.
-    :ivar maybe: topics of its node that it may publish.
+    :ivar possible_topics: topics of its node that it may publish.
     :ivar reads: topics and callbacks of its node that it reads by queue edges.
     :ivar runs: how many executions of it were recorded; None: there is no recording.
     :ivar interval_ns: measured mean time between two of its executions.
     :ivar times: its measured execution time, and the number of measured executions.
-    :ivar also: other declared keys, with their values.
+    :ivar other_keys: other declared keys, with their values.
     :ivar sometimes: topics of ``publishes`` that it publishes only sometimes: in how many of how
         many executions, None if they are declared.
     :ivar judged: of a sink: False if it has no deadline.
-    :ivar driven_by: of a sync of different rates, the topic of ``starts`` that drives it.
+    :ivar driven_by: of a sync of different rates, the topic of ``started_by`` that drives it.
     :ivar why: of a proposed ``driven_by``, a comment with the reason.
     :ivar least_interval_ns: if the times between its executions are irregular, the least of them.
     :ivar stores: whether it seems to only store its message: it is short and publishes nothing.
@@ -72,10 +72,10 @@ class DraftCallback:
     node: str
     name: str
     kind: str
-    starts: list[str] = field(default_factory=list)
+    started_by: list[str] = field(default_factory=list)
     period_ns: int | None = None
     publishes: list[str] = field(default_factory=list)
-    maybe: list[str] = field(default_factory=list)
+    possible_topics: list[str] = field(default_factory=list)
     reads: list[str] = field(default_factory=list)
     group: str | None = None
     dag: str | None = None
@@ -84,7 +84,7 @@ class DraftCallback:
     runs: int | None = None
     interval_ns: int | None = None
     times: tuple[ExecutionTime, int] | None = None
-    also: dict[str, str] = field(default_factory=dict)
+    other_keys: dict[str, str] = field(default_factory=dict)
     sometimes: dict[str, tuple[int, int] | None] = field(default_factory=dict)
     judged: bool = True
     driven_by: str | None = None
@@ -97,7 +97,7 @@ class DraftCallback:
         """Return the topics that start it in a DAG."""
         if self.kind not in ('subscription', 'sync'):
             return []
-        return self.starts if self.driven_by is None else [self.driven_by]
+        return self.started_by if self.driven_by is None else [self.driven_by]
 
     @property
     def key(self) -> str:
@@ -116,7 +116,7 @@ class DraftNode:
 
     name: str
     callbacks: dict[str, DraftCallback] = field(default_factory=dict)
-    taken: list[str] = field(default_factory=list)
+    polled_topics: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -130,7 +130,7 @@ class DraftPath:
     name: str
     steps: list[tuple[str, str, str]]
     keys: list[str] = field(default_factory=list)
-    also: dict[str, str] = field(default_factory=dict)
+    other_keys: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -162,7 +162,7 @@ def leave_out_sources(
     """Leave out some sources, and callbacks whose topics lose all publishers by that."""
     while True:
         published = {topic for callback in draft.callbacks()
-                     for topic in callback.publishes + callback.maybe}
+                     for topic in callback.publishes + callback.possible_topics}
         found = {callback.key for callback in draft.callbacks()
                  if _is_source(callback, published) and which(callback)}
         if not found:
@@ -171,7 +171,7 @@ def leave_out_sources(
             for callback in list(node.callbacks.values()):
                 if callback.key in found:
                     del node.callbacks[callback.name]
-                    what = ' '.join((callback.kind, *callback.starts))
+                    what = ' '.join((callback.kind, *callback.started_by))
                     draft.left_out.append(f'{callback.key} ({what}): {reason}')
         draft.nodes = [node for node in draft.nodes if node.callbacks]
 
@@ -185,7 +185,7 @@ def _is_source(callback: DraftCallback, published: Container[str]) -> bool:
 def accept(draft: Draft) -> None:
     """Replace unknown values by recorded ones, so that the periods of all sources are known."""
     for callback in draft.callbacks():
-        callback.maybe.clear()
+        callback.possible_topics.clear()
     leave_out_sources(draft, lambda callback: callback.source_period_ns is None,
                       'its rate is unknown')
 
@@ -203,7 +203,7 @@ class _Writer:
         self._callbacks = list(draft.callbacks())
         self._published = {topic for each in self._callbacks for topic in each.publishes}
         self._perhaps_published = self._published.union(
-            topic for each in self._callbacks for topic in each.maybe)
+            topic for each in self._callbacks for topic in each.possible_topics)
         self._started: dict[str, list[DraftCallback]] = {}
         for callback in self._callbacks:
             for topic in callback.triggers:
@@ -223,7 +223,7 @@ class _Writer:
                 callback = stack.pop()
                 if callback.key not in found:
                     found[callback.key] = source
-                    stack.extend(after for topic in callback.publishes + callback.maybe
+                    stack.extend(after for topic in callback.publishes + callback.possible_topics
                                  for after in self._started.get(topic, ()))
         return found
 
@@ -258,7 +258,7 @@ class _Writer:
         for callback in node.callbacks.values():
             source = self._fastest.get(callback.key)
             if callback.kind == 'subscription' and source and not self._is_source(callback):
-                topics.setdefault(source.key, []).append(plain_scalar(callback.starts[0]))
+                topics.setdefault(source.key, []).append(plain_scalar(callback.started_by[0]))
         for each in topics.values():
             if len({*each}) > 1:
                 yield ('      # If these are one sync, declare one callback: '
@@ -268,21 +268,21 @@ class _Writer:
         if callback.kind == 'timer':
             yield _timer(callback)
         elif callback.driven_by is not None:
-            yield (f'sync: {{topics: {_listed(callback.starts)}, '
+            yield (f'sync: {{topics: {_listed(callback.started_by)}, '
                    f'driven_by: {callback.driven_by}}}{callback.why}')
         elif callback.kind == 'sync':
-            yield f'sync: {_listed(callback.starts)}'
+            yield f'sync: {_listed(callback.started_by)}'
         else:
-            yield f'{callback.kind}: {callback.starts[0]}'
+            yield f'{callback.kind}: {callback.started_by[0]}'
         if callback.dag and self._is_source(callback):
             yield f'dag: {plain_scalar(callback.dag)}'
         if callback.kind in ('subscription', 'service') or callback.driven_by is not None:
             yield from self._period(callback)
         if callback.group is not None:
             yield f'group: {plain_scalar(callback.group)}'
-        if callback.maybe:
-            yield _blank(f'publishes: {_listed(callback.publishes + callback.maybe)}',
-                         f'which callback publishes {", ".join(callback.maybe)}?')
+        if callback.possible_topics:
+            yield _blank(f'publishes: {_listed(callback.publishes + callback.possible_topics)}',
+                         f'which callback publishes {", ".join(callback.possible_topics)}?')
             if callback.publishes:
                 yield '# (instead of the next line)'
         if always := [t for t in callback.publishes if t not in callback.sometimes]:
@@ -292,7 +292,7 @@ class _Writer:
             yield f'reads: {_listed(map(plain_scalar, callback.reads))}'
         if self._started.keys().isdisjoint(callback.publishes):
             yield self._deadline(callback)
-        yield from (f'{key}: {value}' for key, value in callback.also.items())
+        yield from (f'{key}: {value}' for key, value in callback.other_keys.items())
         if callback.times is not None:
             yield from _execution_time(*callback.times)
 
@@ -311,8 +311,8 @@ class _Writer:
         what = ('the time between two requests' if is_service else
                 'no callback here publishes the topic; the time between two messages')
         if not self._is_source(callback):
-            if callback.starts[0] not in self._published:
-                yield f'# {callback.starts[0]} has no known publisher yet: see its blanks'
+            if callback.started_by[0] not in self._published:
+                yield f'# {callback.started_by[0]} has no known publisher yet: see its blanks'
         elif callback.period_ns is not None:
             yield f'period: {exact_duration(callback.period_ns)}'
             if callback.release_from != 'arrival':
@@ -338,10 +338,10 @@ class _Writer:
     def _deadline(self, callback: DraftCallback) -> str:
         if not callback.judged:
             return 'deadline: none'
-        if callback.deadline_ns is not None and not callback.maybe:
+        if callback.deadline_ns is not None and not callback.possible_topics:
             return f'deadline: {exact_duration(callback.deadline_ns)}'
-        what = 'if it is a sink' if callback.maybe else 'a sink'
-        if callback.stores and not callback.maybe:
+        what = 'if it is a sink' if callback.possible_topics else 'a sink'
+        if callback.stores and not callback.possible_topics:
             return self._proposal('deadline: none', what, 'it seems to only store its message')
         source = self._fastest.get(callback.key)
         if source is None:
@@ -361,7 +361,7 @@ class _Writer:
                 yield f'  - name: {plain_scalar(path.name)}'
                 yield '    callbacks:'
                 yield from (f"      - '{key}'" for key in keys)
-                yield from (f'    {key}: {value}' for key, value in path.also.items())
+                yield from (f'    {key}: {value}' for key, value in path.other_keys.items())
             else:
                 chain = ' -> '.join([*path.keys, *(node for node, _, _ in path.steps)])
                 yield printable(f'# {MARK}: path {path.name}: which callbacks? {chain}')
@@ -370,7 +370,7 @@ class _Writer:
         """Return the callbacks of a path if each of its steps has exactly one, else none."""
         choices = [[c for c in self._callbacks if c.key == key][:1] for key in path.keys]
         choices += [[c for c in self._callbacks if c.node == node
-                     and (taken == UNDEFINED or taken in c.starts or taken in c.reads)
+                     and (taken == UNDEFINED or taken in c.started_by or taken in c.reads)
                      and (published == UNDEFINED or published in c.publishes)]
                     for node, taken, published in path.steps]
         if (len(choices) < 2 or any(len(fits) != 1 for fits in choices)

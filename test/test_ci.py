@@ -69,6 +69,14 @@ def test_tools_that_are_missing_are_known_with_their_packages():
     assert set(lines) == set(re.findall(r"mark\.needs\('(\w+)'\)", tests))
 
 
+@pytest.mark.parametrize('target', ['test', 'test-kilted', 'test-jazzy'])
+def test_make_gets_the_tools_of_the_tests_that_it_runs(target):
+    """In continuous integration a test fails if its program is missing."""
+    done = subprocess.run(
+        ['make', '-n', target], cwd=TOP, text=True, capture_output=True, check=True)
+    assert 'sh .ci/tools install' in done.stdout
+
+
 def test_actions_are_pinned_and_workflows_are_yaml():
     paths = sorted((TOP / '.github' / 'workflows').glob('*.yml'))
     for path in paths:

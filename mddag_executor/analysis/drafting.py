@@ -186,7 +186,7 @@ class System:
         if len(stamps) < LEAST_COPIED or total > (1 + DRIVEN_SHARE) * len(stamps):
             return None
         found = [each for each in several if np.isin(stamps, np.concatenate(
-            self._headers.get(each.starts[0], [_NO_STAMPS]))).mean() >= COPIED_SHARE]
+            self._headers.get(each.started_by[0], [_NO_STAMPS]))).mean() >= COPIED_SHARE]
         return found[0] if len(found) == 1 else None
 
     def draft(self) -> Draft:
@@ -204,7 +204,8 @@ class System:
                 nodes[name] = DraftNode(name, {timer.name: timer})
             if unseen:
                 for callback in nodes[name].callbacks.values() if name in nodes else ():
-                    callback.maybe.extend(t for t in unseen if t not in callback.publishes)
+                    callback.possible_topics.extend(
+                        t for t in unseen if t not in callback.publishes)
         for node in nodes.values():
             self._find_driven(node)
             _find_stores(node)
@@ -241,8 +242,8 @@ class System:
             if driver is not None and several != [driver]:
                 if driver not in several:
                     several.append(driver)
-                why = f'{topic} has the header stamps of {driver.starts[0]}'
-            elif driver is not None or len({each.starts[0] for each in several}) < 2:
+                why = f'{topic} has the header stamps of {driver.started_by[0]}'
+            elif driver is not None or len({each.started_by[0] for each in several}) < 2:
                 continue
             else:
                 driver = min(several, key=lambda each: abs((each.runs or 0) - total))
@@ -251,7 +252,7 @@ class System:
                         (driver.runs or 0) - total) > max(LEAST_SILENT, DRIVEN_SHARE * total):
                     continue
                 why = (f'its executions published {topic} {total} times, and '
-                       f'{driver.starts[0]} came {driver.runs} times')
+                       f'{driver.started_by[0]} came {driver.runs} times')
             _join(node, driver, [each for each in several if each is not driver], topic, why)
 
     def _processes(self, nodes: list[str]) -> dict[str, list[str]]:
@@ -291,7 +292,7 @@ class System:
                 **({} if path.tolerate is None else {'tolerate': str(path.tolerate)})})
             for path in (self.task_set or EMPTY_TASK_SET).paths
             if every.keys() >= set(path.callbacks) and all(
-                not {*before.publishes, before.name}.isdisjoint(after.starts + after.reads)
+                not {*before.publishes, before.name}.isdisjoint(after.started_by + after.reads)
                 for before, after in pairwise(every[key] for key in path.callbacks))]
 
     def _callback(self, entity: Callback, node: DraftNode) -> DraftCallback:
@@ -338,7 +339,8 @@ class System:
             t for t in dict.fromkeys(runs.topics)
             if t not in callback.publishes and not is_background(t, callback.node)
             and TOPIC.fits(t))
-        callback.maybe = [t for t in callback.maybe if t not in callback.publishes]
+        callback.possible_topics = [
+            t for t in callback.possible_topics if t not in callback.publishes]
         if callback.kind != 'sync':     # each of its messages runs it, and one of them publishes
             silent = {topic: count - n for topic, n in runs.published.items()}
             callback.sometimes.update({
@@ -346,7 +348,7 @@ class System:
                 if silent.get(topic, 0) > max(LEAST_SILENT, LEAST_SILENT_SHARE * count)})
         if callback.kind == 'timer' and count == 1 and (
                 self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
-            callback.also['once'] = 'true'
+            callback.other_keys['once'] = 'true'
         if callback.kind == 'sync':
             legs = [self._runs[number] for number, declared in self._declared.items()
                     if declared.key == callback.key]
@@ -374,7 +376,7 @@ class System:
             waiting.setdefault((entity.node_name, entity.kind, start), []).append(entity)
         count = 0
         for callback in draft.callbacks():
-            start = callback.starts[0] if callback.starts else str(callback.period_ns)
+            start = callback.started_by[0] if callback.started_by else str(callback.period_ns)
             fits = waiting.get((callback.node, callback.kind, start))
             if fits:
                 count += self._measure(callback, fits.pop(0))
@@ -396,13 +398,13 @@ def _join(
     published = {
         each: sum(_published_by(c, each) for c in (driver, *others) if each in c.publishes)
         for each in dict.fromkeys(t for c in (driver, *others) for t in c.publishes)}
-    driver.kind, driver.driven_by = 'sync', driver.starts[0]
+    driver.kind, driver.driven_by = 'sync', driver.started_by[0]
     driver.publishes = list(published)
     driver.sometimes = {
         each: (count, runs) for each, count in published.items()
         if each != topic and runs - count > max(LEAST_SILENT, DRIVEN_SHARE * runs)}
     for other in others:
-        driver.starts += other.starts
+        driver.started_by += other.started_by
         if other.times is not None and (driver.times is None or (
                 other.times[0].mean_ns > driver.times[0].mean_ns)):
             driver.times = other.times
@@ -451,7 +453,7 @@ def _is_shown(entity: Callback) -> bool:
 
 def _from_declared(declared: Declared) -> DraftCallback:
     starts = [declared.service] if declared.service else list(declared.topics)
-    also = {key: str(value).lower() for key, value, usual in (
+    other_keys = {key: str(value).lower() for key, value, usual in (
         ('on_late', declared.on_late, None),
         ('keep', declared.keep, 'all'),
         ('importance', declared.importance, 'normal'),
@@ -464,5 +466,6 @@ def _from_declared(declared: Declared) -> DraftCallback:
         declared.node, declared.name, declared.kind, starts, declared.period_ns,
         list(declared.may_publish), [],
         list(declared.reads), declared.group, declared.dag, declared.deadline_ns,
-        declared.release_from, also=also, judged=declared.judged, driven_by=declared.driven_by,
+        declared.release_from, other_keys=other_keys, judged=declared.judged,
+        driven_by=declared.driven_by,
         sometimes=dict.fromkeys(declared.may_publish))

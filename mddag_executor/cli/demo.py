@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--duration', type=options.duration, default=20 * 10 ** 9, metavar='TIME',
         help="how long to measure this executor (default: 20s), and half of it rclpy's")
     add('--utilisation', type=options.positive_float, default=UTILISATION, metavar='U',
-        help='normalised utilisation that execution times are scaled to (default: %(default)s)')
+        help='utilisation that execution times are scaled to (default: %(default)s)')
     add('-o', '--output', default='build/demo', metavar='DIR',
         help='where the trace and the result of each step are written (default: build/demo)')
     options.add(parser, '--json')

@@ -37,17 +37,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the run to compare with: a trace, recorded or imported ('-': standard input), or a "
         'folder with the traces of all its processes')
     add('second', metavar='B.mcap', type=options.Input,
-        help="the run to compare, likewise ('-': standard input)")
+        help="the other run, in the same form ('-': standard input)")
     add('graph', metavar='GRAPH', nargs='?', type=options.Input,
-        help="the declaration that judges both ('-': standard input; default: each by the one "
-        "that it was recorded with, an imported one by the other's)")
+        help="the declaration that judges both ('-': standard input; default: each run is "
+        "judged by the one that it was recorded with, or else by that of the other run)")
     add('--callbacks', action='store_true', help='also show a table of all callbacks')
     add('--fail-on-worse', action='store_true',
         help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
         'p99 response time grew by more than is allowed')
     add('--allow-growth', type=_share, metavar='SHARE',
         help='with --fail-on-worse and in the tables: how much the p99 response time of a sink '
-        'may grow, as 10%% (default: by any amount)')
+        'may grow, for instance 10%% (default: by any amount)')
     options.add(parser, '--from', '--json')
 
 

@@ -151,7 +151,7 @@ def _write(args: argparse.Namespace, outcome: Evaluation) -> None:
 
 def _summary(outcome: Evaluation) -> str:
     many = len(outcome.experiments)
-    of_many = f' of {many} task sets' if many > 1 else ''
+    of_many = f' of {many} declarations' if many > 1 else ''
     each = outcome.elapsed_s / outcome.runs / len(outcome.experiment.policies)
     return (f'{counted(outcome.runs, "run")}{of_many} in {outcome.elapsed_s:.1f} s, '
             f'{1000 * each:.2f} ms for each run and policy '

@@ -34,10 +34,10 @@ REMOVED_OPTIONS = {'--skip': 'it is --from now'}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     options.add_recording(parser, "a recorded run, an MCAP file ('-': standard input)")
-    add('--sink', metavar='S',
+    add('--sink', metavar='SINK',
         help='only jobs of this sink: /node:callback, or the end of its name, as tables show it')
-    add('--job', type=options.not_negative_int, metavar='K',
-        help='only the job of this number')
+    add('--job', type=options.not_negative_int, metavar='N',
+        help='only the job with this number')
     options.add(parser, '--from', '--to', '--json')
 
 

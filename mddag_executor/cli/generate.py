@@ -46,18 +46,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the declaration ('-': standard output, the default); with --sets a new folder")
     options.add(parser, '--overwrite')
     parser.add_argument('--sets', type=options.positive_int, metavar='N',
-                        help='make N task sets, OUT/set_0000.yaml and so on')
+                        help='make N declarations, OUT/set_0000.yaml and so on')
     add('--dags', whole, 'N[:N]', 'number of DAGs')
     add('--vertices', whole, 'N[:N]', 'number of callbacks of each DAG')
     add('--sinks', whole, 'N[:N]', 'number of sinks of each DAG, each with its own deadline')
     add('--edge-probability', options.number, 'P',
         'probability of an edge between two callbacks of a DAG')
     add('--or-share', options.number, 'P',
-        'share of the callbacks with several predecessors that run once for each message, and so '
-        'are several vertices; the others join the messages')
+        'share of the callbacks with several predecessors that run once for each message, so '
+        'that they are several vertices; the others wait for all of the messages (sync)')
     add('--utilisation', real, 'U[:U]',
-        'the load of all DAGs divided by the workers; with --sets two bounds, over which the sets '
-        'are spread evenly')
+        'the load of all DAGs divided by the number of workers; with --sets two bounds, over '
+        'which the declarations are spread evenly')
     add('--workers', options.workers, 'M', 'declared number of workers')
     add('--max-dag-load', options.number, 'L', 'largest load of a DAG, in cores', 'most_per_dag')
     add('--periods', lambda text: tuple(options.list_of(options.duration)(text)), 'TIME,TIME…',
@@ -91,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
             'generating', len(every)) as line:
         for number, (name, each) in enumerate(zip(names, every)):
             (folder / name).write_text(generate(each, number), encoding='utf-8')
-            line.update(number, f'of {len(every)} task sets')
+            line.update(number, f'of {len(every)} declarations')
     return 0
 
 
@@ -102,8 +102,8 @@ def _every(args: argparse.Namespace) -> Iterator[Options]:
     if sets > _MOST_SETS:
         raise UsageError(f'--sets {sets}: it is too many: give at most {_MOST_SETS}')
     if low > high or (low != high and sets == 1):
-        raise UsageError(f'--utilisation {low:g}:{high:g}: one task set has one, and the smaller '
-                         'of two comes first: give a number, or low:high with --sets')
+        raise UsageError(f'--utilisation {low:g}:{high:g}: one declaration has one, and the '
+                         'smaller of two comes first: give a number, or low:high with --sets')
     base = Options(**{field.name: getattr(args, field.name) for field in fields(Options)
                       if field.name != 'utilisation'})
     for number in range(sets):

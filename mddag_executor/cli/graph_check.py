@@ -28,9 +28,9 @@ mddag graph check config/autoware.yaml --budget p99 --workers 4 --json -
 mddag graph check graph.yaml --fail-on-unschedulable
 """
 DESCRIPTION = """\
-Validate a declaration and show the DAG tasks that it gives: period, number of vertices, sinks with
-deadlines, critical path and load in cores, the last two with the mean execution times (- if one
-is not declared). The utilisation is the load of all DAGs divided by the workers.
+Validate a declaration and show its DAGs: period, number of vertices, sinks with deadlines,
+critical path, and load in cores. Critical path and load are those of the mean execution times (-
+if one is not declared). The utilisation is the load of all DAGs divided by the workers.
 
 If all execution times are declared, three tests follow. If one fails, no scheduler can keep the
 deadlines, and a warning says so. If all hold, the deadlines can still be missed: the tests include
@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, 'graph', '--workers', '--json')
     parser.add_argument(
         '--budget', choices=defaults.BUDGETS, default='mean',
-        help='what of each execution time the tests count: its maximum, 99 %% quantile or mean '
-        '(default)')
+        help='which value of each execution time the tests use: its maximum, 99 %% quantile or '
+        'mean (the default)')
     parser.add_argument(
         '--fail-on-unschedulable', action='store_true',
         help='exit with status 1 if a test fails, and 2 if an execution time is not declared')

@@ -18,10 +18,9 @@ DESCRIPTION = """\
 Make a declaration from a CARET architecture file: nodes, callbacks, timers, topics, callback
 groups, variable passings, message contexts and named paths. Facts that such a file lacks
 (deadlines, rates from outside, which callback publishes) are in comments marked 'FILL IN', with a
-proposal; remove the first '# ' of such a line once its value is right. With a recording of
-the same system (TRACE) the rates of sources are proposed from it, the quantiles of the measured
-execution times (0, 50, 90, 99, 100 %) are filled in, and the recorded publishers of a topic
-are filled in."""
+proposal; remove the first '# ' of such a line once its value is right. A recording of the same
+system (TRACE) proposes the rates of sources, and fills in the quantiles of the measured execution
+times (0, 50, 90, 99, 100 %) and the publishers of each topic."""
 
 REMOVED_OPTIONS = {'--trace': 'name the recording after ARCHITECTURE.yaml'}
 
@@ -32,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('trace', metavar='TRACE', type=options.Input, nargs='?',
                         help='measure rates and execution times in this recording: a trace '
                         "(MCAP; '-': standard input), or the folder of a session that LTTng "
-                        'recorded (needs python3-bt2)')
+                        'recorded')
     options.add(parser, '--output', '--overwrite')
 
 

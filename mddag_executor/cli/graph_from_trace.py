@@ -15,26 +15,25 @@ mddag graph from-trace run.mcap --accept -o graph.yaml
 mddag graph from-trace ~/.ros/tracing/session-20261121 -o graph.yaml
 """
 DESCRIPTION = """\
-Make a declaration from a recorded run: a trace of this executor, a CARET or ros2_tracing recording
-that was imported, or the folder of one. A trace shows the nodes, their timers, subscriptions and
-services, callback groups, what each callback published, and the quantiles of its execution time
-(0, 50, 90, 99, 100 %). Facts that it lacks (deadlines, periods of messages from outside, queue
-edges) are in comments marked 'FILL IN', with a proposal from the recorded rates; remove the
-first '# ' of such a line once its value is right. If the run was recorded with a declaration, its
-names, deadlines, queue edges and paths are kept. Services that every node has, such as those for
-parameters, are left out, and so are services and subscriptions from outside that never ran; the
-declaration names the latter."""
+Make a declaration from a recorded run: a trace of this executor, an imported recording of CARET
+or ros2_tracing, or the folder of such a recording. A trace shows the nodes, their timers,
+subscriptions and services, callback groups, what each callback published, and the quantiles of
+its execution time (0, 50, 90, 99, 100 %). Facts that it lacks (deadlines, periods of messages
+from outside, queue edges) are in comments marked 'FILL IN', with a proposal from the recorded
+rates; remove the first '# ' of such a line once its value is right. If the run was recorded with
+a declaration, its names, deadlines, queue edges and paths are kept. Services that every node has,
+such as those for parameters, are left out, and so are services and subscriptions from outside
+that never ran. A comment in the declaration lists these."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('trace', metavar='TRACE', type=options.Input,
                         help="a trace (MCAP; '-': standard input), or the folder of a session "
-                        'that LTTng recorded (needs python3-bt2)')
+                        'that LTTng recorded')
     parser.add_argument('--accept', action='store_true',
-                        help='accept the proposals: the period of a source is the measured one, '
-                        'a deadline is the period of the source that leads to the sink; what was '
-                        'not seen to be published is not, and a source without a measured rate '
-                        'is left out')
+                        help='accept the proposals: a source gets its measured period, and a sink '
+                        'the period of its source as deadline; topics that were not seen to be '
+                        'published, and sources without a measured rate, are left out')
     options.add(parser, '--output', '--overwrite')
 
 

@@ -21,8 +21,8 @@ mddag graph place graph.yaml run.mcap --processes 3 -o placed.yaml
 mddag replay run.mcap --reschedule --processes placed.yaml
 mddag run placed.yaml --node my_robot/lidar --node my_robot/camera --node my_robot/control"""
 DESCRIPTION = """\
-Pack the nodes of a declaration into processes, so that the process that needs Python's
-interpreter for the longest time needs it as little as possible. Nodes that publish the same topic
+Pack the nodes of a declaration into processes, so that the busiest process needs Python's
+interpreter for as little time as possible. Nodes that publish the same topic
 stay together. The result is the declaration with `processes:`, as `mddag run` reads it: move nodes
 there by hand if they must be together or apart. Deadlines are not considered:
 'mddag replay RUN.mcap --reschedule --processes PLACED.yaml' checks them."""
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--overwrite', 'graph', '--json')
     add('trace', metavar='TRACE', type=options.Input, nargs='*',
         help='use the execution times of this recorded run, and which callbacks compute in Python '
-        'there (default: as declared); for a run of several processes the traces of all')
+        'there (default: as declared); if a run had several processes, name the traces of all')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -11,9 +11,9 @@ from mddag_executor.cli.text import printable, Progress, say, warn
 from mddag_executor.text import counted
 
 DESCRIPTION = """\
-Turn a session that LTTng recorded (CARET, ros2_tracing), all its processes and events, into a
-trace. No other program is needed. Several sessions of one run, of one or several computers, become
-one trace; what is damaged is read up to the damage."""
+Turn a session that LTTng recorded (with CARET or ros2_tracing) into a trace, with all its
+processes and events. No other program is needed. Several sessions of one run, of one or several
+computers, become one trace. A damaged session is read up to the damage."""
 EXAMPLE = """\
 mddag import ctf ~/.ros/tracing/session-20261121101500 -o drive.mcap
 mddag replay drive.mcap graph.yaml"""
@@ -22,7 +22,8 @@ mddag replay drive.mcap graph.yaml"""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'session', metavar='SESSION', nargs='+',
-        help='the folder that was recorded to; of a run on several computers the folder of each')
+        help='the folder that was recorded to; if a run had several computers, name the folder of '
+        'each')
     parser.add_argument('-o', '--output', metavar='OUT.mcap', required=True, type=options.Trace,
                         help='the trace to write')
     options.add(parser, '--overwrite')

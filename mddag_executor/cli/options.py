@@ -173,11 +173,11 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'help': 'write tables and pictures of the run as one HTML file that needs no network '
         "('-': to standard output)"},
     '--workers': {
-        'type': workers, 'metavar': 'M', 'help': 'threads that run callbacks',
+        'type': workers, 'metavar': 'N', 'help': 'threads that run callbacks',
         'otherwise': f"the declaration's, else {defaults.WORKERS}"},
     '--cpus': {
         'type': positive_int, 'metavar': 'C',
-        'help': 'CPUs that callbacks which compute share', 'otherwise': 'enough for all'},
+        'help': 'number of CPUs that computing callbacks share', 'otherwise': 'enough for all'},
     '--preemptive': {
         'action': argparse.BooleanOptionalAction,
         'help': 'let more urgent callbacks preempt running ones',
@@ -207,24 +207,26 @@ _SHARED: dict[str, dict[str, Any] | Callable[[], dict[str, Any]]] = {
         'otherwise': 'the number of processors'},
     '--utilisation': {
         'type': utilisation, 'metavar': 'U',
-        'help': 'scale the execution times to this normalised utilisation, sum(C/T)/workers'},
+        'help': 'scale the execution times to this utilisation: the load of all DAGs divided by '
+        'the number of workers'},
     '--from': {
         'type': duration_or_zero, 'metavar': 'TIME', 'dest': 'begin',
-        'help': 'only jobs that were released from this time on, counted from the first release, '
-        'for instance 90s', 'otherwise': 'from the start'},
+        'help': 'only jobs released at this time or later, counted from the first release, for '
+        'instance 90s', 'otherwise': 'from the start'},
     '--to': {
         'type': duration, 'metavar': 'TIME', 'dest': 'end',
-        'help': 'only jobs that were released before this time', 'otherwise': 'to the end'},
+        'help': 'only jobs released before this time', 'otherwise': 'to the end'},
     '--offset': {
         'type': _offset, 'action': 'append', 'default': [], 'metavar': 'NAME=TIME',
-        'help': 'for recordings of several machines: how far the clock of process NAME (the one '
-        "of RUN.NAME.mcap, or a trace) is ahead of the first trace's, for instance 2.5ms, or "
-        '-2.5ms if it is behind', 'otherwise': 'estimated from messages in both directions'},
+        'help': 'for recordings of several machines: how far the clock of process NAME (that of '
+        "RUN.NAME.mcap, or of a trace with this name) is ahead of the first trace's clock, for "
+        'instance 2.5ms, or -2.5ms if it is behind',
+        'otherwise': 'estimated from messages in both directions'},
     '--overwrite': {
         'action': 'store_true', 'help': 'replace an existing recording or declaration'},
     '--ros-args': {
         'nargs': argparse.REMAINDER, 'metavar': '…',
-        'help': 'pass the rest of the command line to rclpy.init, for instance -r from:=to'},
+        'help': 'pass the rest of the command line to rclpy.init, for instance -r /from:=/to'},
 }
 
 
@@ -251,8 +253,8 @@ def _on_late() -> dict[str, Any]:
     from mddag_executor.core.tables import ON_LATE
     return {
         'choices': (*ON_LATE,), 'default': 'continue', 'otherwise': '%(default)s',
-        'help': 'what is done with a job that can no longer be in time, if the declaration does '
-        'not say it'}
+        'help': 'what to do with a job that can no longer be in time, unless the declaration says '
+        'it'}
 
 
 def add(
@@ -286,7 +288,7 @@ def add_recording(parser: argparse.ArgumentParser, what: str) -> None:
     """Declare `TRACE… [GRAPH]` (see `common.recording_and_graph`); `what`: TRACE's help."""
     parser.add_argument(
         'trace', metavar='TRACE', nargs='+', type=Input,
-        help=f'{what}; for one run of several processes the traces of all')
+        help=f'{what}; if a run had several processes, name the traces of all')
     parser.add_argument(
         'graph', metavar='GRAPH', nargs='?', type=Input,
         help="the declaration to judge by, a .yaml or .yml file ('-': standard input; "

@@ -53,6 +53,12 @@ def _is_option(word: str) -> bool:
     return len(word) > 2 if word.startswith('--') else word[:1] == '-' and word[1:].isalpha()
 
 
+def _example(text: str) -> str:
+    """Return the end of a help text: commands, and perhaps a paragraph below them."""
+    commands, *below = text.strip().split('\n\n')
+    return '\n\n'.join(('\n  '.join(('example:', *commands.splitlines())), *below))
+
+
 def verb_parser(prog: str, module: ModuleType, summary: str) -> Parser:
     """
     Return the parser of a verb.
@@ -64,7 +70,7 @@ def verb_parser(prog: str, module: ModuleType, summary: str) -> Parser:
     parser = Parser(
         prog=prog, allow_abbrev=False,
         description=getattr(module, 'DESCRIPTION', f'{summary[:1].upper()}{summary[1:]}.'),
-        epilog='\n  '.join(('example:', *module.EXAMPLE.strip().splitlines())),
+        epilog=_example(module.EXAMPLE),
         formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.removed_options = getattr(module, 'REMOVED_OPTIONS', {})
     module.add_arguments(parser)

@@ -33,13 +33,14 @@ REMOVED_OPTIONS = {'--skip': 'it is --from now'}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     options.add_recording(
-        parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule it can be "
-        'an ordinary bag, a folder or a file')
+        parser, "a recorded run, an MCAP file ('-': standard input); with --reschedule also an "
+        'ordinary bag, which is a folder or a file')
     recorded.add_arguments(parser)
     add('--callbacks', action='store_true', help='also show a table of all callbacks')
     options.add(parser, '--fail-on-miss')
     add('--github', action='store_true',
-        help='print an annotation for GitHub Actions for each sink that missed more than that')
+        help='print an annotation for GitHub Actions for each sink that missed more deadlines '
+        'than are tolerated')
     add('--junit', metavar='OUT.xml', type=options.Output,
         help="write JUnit XML, a test case for each sink ('-': to standard output)")
     options.add(parser, '--from', '--to', '--report', '--json')

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'input)')
     options.add(parser, 'graph', '--workers', '--json', '--overwrite', '--ros-args')
     add('--node', metavar='SPEC', action='append', required=True,
-        help='run this node, as mddag run does; repeat it for more nodes')
+        help='run this node, as mddag run does; repeat the option for more nodes')
     add('-o', '--output', metavar='OUT.mcap', type=options.Bag,
         help='write what the nodes publish to this bag, with virtual times')
     add('--trace', metavar='RUN.mcap', type=options.Trace,
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'differs')
     add('--allow-difference', type=options.share, default=0.0, metavar='X',
         help='with --expect: floating-point numbers may differ by this much, or by this share of '
-        'the larger one (default: 0)')
+        'the larger number (default: 0)')
     add('--execution-times', metavar='WHICH', type=options.Input,
         help='how long callbacks take: recorded (the default for a trace), declared (the default '
         'for a bag), or a file: a trace, or JSON with execution times')
@@ -59,7 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(parser, '--seed',
                 help="seed of Python's and numpy's random numbers and of declared times")
     add('--all-clocks', action='store_true',
-        help='also make steady and system clocks, and the functions of the module time, virtual')
+        help='make steady and system clocks, and the functions of the module time, virtual as '
+        'well')
 
 
 def main(args: argparse.Namespace) -> int:

@@ -51,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--parallel', type=options.positive_int, metavar='N',
         help='how many processes search (default: one for each processor)')
     add('--fail-under', type=options.positive_float, metavar='FACTOR',
-        help='exit with status 1 if some callback may not take this many times as long, if a '
-        'deadline is missed already, or if no job was due')
+        help='exit with status 1 if the factor of a callback is smaller, if a deadline is missed '
+        'already, or if no job was due')
     add('--report', metavar='OUT.html', type=options.Output,
         help="write the tables with bars as one HTML file ('-': to standard output)")
     options.add(parser, '--from', '--json')

@@ -13,25 +13,25 @@ TASKS = {
         'run': 'run rclpy nodes, or nodes made from the declaration, and record them',
         'rerun': 'run real nodes again from a recording, in virtual time',
         'top': 'show the deadlines and workers of running executors, live',
-        'demo': 'run the whole Autoware workload, record it and replay the recording'},
+        'demo': 'run, record and replay the Autoware workload, and compare with rclpy'},
     'Judge': {
         'replay': 'check a recorded run against its deadlines, or reschedule it',
         'explain': 'say why each deadline of a recorded run was missed',
-        'slack': 'find how much longer callbacks may take before a deadline is missed',
+        'slack': 'find how much longer callbacks can take before a deadline is missed',
         'diff': 'compare two recorded runs sink by sink',
         'export': 'turn a recording into files for Perfetto or for data frames',
         'import ctf': 'turn a CARET or ros2_tracing recording (LTTng) into a trace'},
     'Declare': {
         'graph check': 'validate a declaration, show its DAGs and whether the deadlines can hold',
         'graph draw': 'draw the DAGs of a declaration (SVG, PNG, PDF, DOT, Mermaid)',
-        'graph from-trace': 'make a declaration to fill in from a recorded run',
-        'graph from-caret': 'make a declaration to fill in from a CARET architecture file',
-        'graph place': 'pack the nodes into processes, so that each needs Python little',
+        'graph from-trace': 'draft a declaration from a recorded run',
+        'graph from-caret': 'draft a declaration from an architecture file of CARET',
+        'graph place': 'pack the nodes into processes that need Python evenly',
         'graph schema': 'print the JSON Schema of declarations, for editors'},
     'Laboratory': {
-        'simulate': 'run a declaration in virtual time',
+        'simulate': 'run a declaration once, in virtual time',
         'evaluate': 'measure acceptance ratios over many simulated runs',
-        'generate': 'make random multi-deadline, multi-rate DAG sets',
+        'generate': 'make random declarations, with several deadlines and rates',
         'graph assign-deadlines': 'give the sinks deadlines, by critical paths and requirements'},
 }
 VERBS = {verb: summary for verbs in TASKS.values() for verb, summary in verbs.items()}

@@ -56,21 +56,22 @@ class RunOptions:
 
     nodes: Sequence[Spec] = option(
         (), 'run this node: package/executable (unmodified, as ros2 run does), module:function '
-        'or module:NodeClass; arguments for it follow in the same word, as '
-        "'pkg/exe --rate 2'; repeat it for more nodes",
+        'or module:NodeClass; quote a node and its arguments as one word: '
+        "'pkg/exe --rate 2'; repeat the option for more nodes",
         flag='--node', kind='several', metavar='SPEC', group='what', of_the_run=True)
     synthetic: str | None = option(
         None, 'make the nodes from the declaration; for the declared execution times their '
-        'callbacks sleep, compute in Python, compute without the interpreter lock, or, drawn for '
-        'each callback, do one of the three', choices=MODES, group='what', of_the_run=True)
+        "callbacks sleep, compute in Python (spin), compute without Python's lock (native), or do "
+        'one of the three, drawn for each callback (mixed)', choices=MODES, group='what',
+        of_the_run=True)
     utilisation: float | None = option(None, only='with --synthetic: ')
     seed: int = option(0, only='with --synthetic: ')
     duration: int | str | None = option(
-        None, 'end after this time, for instance 20s, with --synthetic after a warm-up of 1 s '
-        '(default: run until Ctrl-C)', kind='duration', metavar='TIME')
+        None, 'end after this time, for instance 20s; with --synthetic, it begins after a warm-up '
+        'of 1 s (default: run until Ctrl-C)', kind='duration', metavar='TIME')
     concurrent: Sequence[str] = option(
         (), 'let the callbacks of this node overlap with others of its program, even if the '
-        'program spins in a single thread; repeat it for more nodes',
+        'program spins in a single thread; repeat the option for more nodes',
         kind='several', metavar='NAME')
     policy: str = option('rad')
     workers: int | None = option(None)
@@ -79,23 +80,23 @@ class RunOptions:
         '1s', "how often to publish the executor's state on /diagnostics, for mddag top and other "
         "tools; 'off': never (default: 1s)", kind='time or off', metavar='TIME')
     trace: str | os.PathLike[str] | None = option(
-        None, 'record the run to this file; of several processes each to OUT.NAME.mcap, or to '
-        'NAME.mcap in OUT if that is a directory', kind='trace', metavar='OUT.mcap',
-        of_the_run=True)
+        None, 'record the run to this file; if the run has several processes, each records to '
+        'OUT.NAME.mcap, or to NAME.mcap in OUT if that is a directory', kind='trace',
+        metavar='OUT.mcap', of_the_run=True)
     processes: int | str | os.PathLike[str] | None = option(
-        None, 'run the nodes in N processes, or in those of a YAML file with `processes:` '
-        "(default: those of the declaration); '1': in this process", kind='input',
+        None, 'run the nodes in N processes (1: in this one), or in those of a YAML file with '
+        '`processes:` (default: those of the declaration)', kind='input',
         metavar='N|FILE', group='several processes', of_the_run=True)
     process: str | None = option(
         None, 'run only the nodes of this declared process, for a launch file that starts each '
         'process; give the --node options of these nodes only', metavar='NAME',
         group='several processes', of_the_run=True)
     on_exit: str = option(
-        'end', 'if one of several processes ends by itself: end the run, or continue without it '
+        'end', 'when one of several processes ends by itself, end the run, or continue without it '
         '(default: end)', choices=('end', 'continue'), group='several processes', of_the_run=True)
     graph: str | os.PathLike[str] | TaskSet | None = option(
         None, "the declaration, a YAML file ('-': standard input); with --node it may be left "
-        'out: then nothing is judged, and a trace shows what there is to declare',
+        'out: then nothing is judged, and a declaration can be drafted from the trace',
         flag='graph', kind='input', metavar='GRAPH', of_the_run=True)
     overwrite: bool = option(False)
     ros_args: Sequence[str] = option(())
@@ -113,7 +114,7 @@ class RunOptions:
         for name, least in (('workers', 1), ('seed', 0)):
             value = getattr(self, name)
             if value is not None and (type(value) is not int or value < least):
-                raise UsageError(f'{name}={value!r}: give a whole number from {least} up')
+                raise UsageError(f'{name}={value!r}: give an integer from {least} up')
         for name in ('duration', 'diagnostics'):
             self._set(name, _nanoseconds(name, getattr(self, name)))
         for name in ('nodes', 'concurrent', 'ros_args'):
@@ -131,7 +132,7 @@ class RunOptions:
                             if getattr(self, name) not in (None, '1')), None)
         if self.graph is None and needs_graph is not None:
             raise UsageError(
-                f'--{needs_graph}: it is about the nodes of a declaration: give a GRAPH')
+                f'--{needs_graph}: it needs the nodes of a declaration: give a GRAPH')
         if self.synthetic is None and self.utilisation is not None:
             raise UsageError(
                 '--utilisation: it scales synthetic nodes only: add --synthetic or leave it out')

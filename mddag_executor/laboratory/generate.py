@@ -161,7 +161,7 @@ def _costs(dice: Dice, shape: Shape, volume: int) -> list[int]:
 
 
 def _lines(options: Options, number: int, dags: list[_Dag]) -> Iterator[str]:
-    yield f"# Random task set {number} of 'mddag generate', with seed {options.seed}:"
+    yield f"# Random declaration {number} of 'mddag generate', with seed {options.seed}:"
     for field in fields(options):
         value = getattr(options, field.name)
         if isinstance(value, tuple):

@@ -96,7 +96,7 @@ def _title(evaluation: Evaluation) -> str:
     least, most = min(workers), max(workers)
     return (
         f'{counted(evaluation.runs, "run")} of {evaluation.experiment.duration_ns / 1e9:g} s, '
-        + (f'{many} task sets, ' if many > 1 else '')
+        + (f'{many} declarations, ' if many > 1 else '')
         + (counted(most, 'worker') if least == most else f'{least} to {most} workers'))
 
 

@@ -27,7 +27,7 @@ def test_figure(graph, tmp_path, call, ending, start):
         pictures.append((tmp_path / name).read_bytes())
     assert pictures[0].startswith(start) and pictures[0] == pictures[1]
     if ending == 'svg':
-        for text in (b'normalised utilisation', b'acceptance ratio', b'2 task sets'):
+        for text in (b'normalised utilisation', b'acceptance ratio', b'2 declarations'):
             assert text in pictures[0]
 
 

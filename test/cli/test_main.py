@@ -126,7 +126,9 @@ def printed(capsys, *words):
 
 def test_the_help_of_each_verb(capsys):
     for verb in program.VERBS:
-        assert f'example:\n  mddag {verb}' in printed(capsys, *verb.split(), '--help')
+        text = printed(capsys, *verb.split(), '--help')
+        assert f'\nexample:\n  mddag {verb}' in text
+        assert not re.search(r' $|^ +exit status', text, re.M)
     for family in ('', 'graph'):
         found = re.findall(r'^  ([a-z-]+(?: [a-z-]+)?)  ', printed(
             capsys, *family.split(), '--help'), re.M)
