@@ -77,7 +77,8 @@ def pytest_configure(config):
         signal.signal(signal.SIGINT, signal.default_int_handler)
     # What pytest itself keeps stays where it is.
     os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', tempfile.gettempdir())
-    os.environ.setdefault('MDDAG_DEBUG', 'engine')  # programs that tests start inherit it
+    # programs that tests start inherit it
+    os.environ.setdefault('MDDAG_DEBUG', str(HERE / 'invariants.py'))
     tempfile.tempdir = _session.enter_context(
         tempfile.TemporaryDirectory(prefix='mddag-test-', ignore_cleanup_errors=True))
     os.environ.pop('ROS_STATIC_PEERS', None)

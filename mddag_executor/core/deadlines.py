@@ -11,7 +11,6 @@ next job, and is replaced when its time has come.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from heapq import heappop, heappush
 
 from mddag_executor.core.jobs import judge_incomplete, next_deadline
@@ -64,16 +63,6 @@ class Deadlines:
                 del self._entry[slot]
             self.next = heap[0][0] if heap else NEVER
         return self.next
-
-    def broken_invariants(self) -> Iterator[str]:
-        """Yield a sentence for each invariant that does not hold; for debugging."""
-        if self.next != (self._heap[0][0] if self._heap else NEVER):
-            yield f'the next deadline is not {self.next}'
-        for slot, judged in self._judged.items():
-            if self._state.job_state[slot] == OPEN:
-                time = next_deadline(*self._rule, slot, judged)
-                if self._entry.get(slot, NEVER) > time:
-                    yield f'no timer is set for the deadline {time} of the job in slot {slot}'
 
     def _add(self, slot: int, after: int) -> None:
         time = next_deadline(*self._rule, slot, after)

@@ -34,6 +34,9 @@ class Agenda:
     While a thread waits for events, it wakes up for each appointment when it is due.  While a
     callback computes, no thread waits, and it is enough to notice each until its latest time.  All
     methods need one lock.
+
+    :ivar next: a time at or before that of the next appointment (``first``).
+    :ivar latest: a time at or before that until which one must be noticed (``first_latest``).
     """
 
     def __init__(self) -> None:
@@ -42,6 +45,7 @@ class Agenda:
         self._latest: list[tuple[int, int, list[Any]]] = []
         self._entries = 0
         self._appointments = 0
+        self.next = self.latest = NEVER
 
     def set(self, appointment: Appointment, at: int, latest: int) -> None:
         """Set an appointment, which may be set already, for a time."""
@@ -53,6 +57,10 @@ class Agenda:
         entry = appointment.entry = [appointment]
         heappush(self._heap, (at, number, entry))
         heappush(self._latest, (latest, number, entry))
+        if at < self.next:
+            self.next = at
+        if latest < self.latest:
+            self.latest = latest
         most = 2 * self._appointments + 8   # more after many changes
         if len(self._heap) > most:
             self._heap = _without_cancelled(self._heap)
@@ -70,14 +78,16 @@ class Agenda:
         heap = self._heap
         while heap and not heap[0][2]:
             heappop(heap)
-        return heap[0][0] if heap else NEVER
+        self.next = heap[0][0] if heap else NEVER
+        return self.next
 
     def first_latest(self) -> int:
         """Return until when the next appointment must be noticed."""
         heap = self._latest
         while heap and not heap[0][2]:
             heappop(heap)
-        return heap[0][0] if heap else NEVER
+        self.latest = heap[0][0] if heap else NEVER
+        return self.latest
 
     @property
     def last(self) -> int:
@@ -98,6 +108,7 @@ class Agenda:
                 self._appointments -= 1
                 appointment.come_due()
                 return True
+        self.next = heap[0][0] if heap else NEVER
         return False
 
 

@@ -1,10 +1,11 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Checks of the engine at the end of every section under its lock.
+Checks of the engine at the end of every section under its lock, for tests.
 
-``MDDAG_DEBUG=1`` switches on these checks and the tracebacks of errors (``cli.main``);
-``MDDAG_DEBUG=engine`` only these checks.
+If ``MDDAG_DEBUG`` names a Python file, its function ``broken_invariants`` is called with the
+engine.  It yields a sentence for each invariant that does not hold.  (The value 1 asks for the
+tracebacks of errors: ``cli.main``.)
 
 A check costs time for each waiting execution and each open job.  So if there are more than
 ``CHECKED_PER_SECTION`` of these, only some sections are followed by a check.
@@ -12,13 +13,15 @@ A check costs time for each waiting execution and each open job.  So if there ar
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import cache
 import os
+import runpy
 import threading
 from types import TracebackType
 from typing import Any
 
-from mddag_executor.errors import MddagError
+from mddag_executor.errors import MddagError, UsageError
 
 VARIABLE = 'MDDAG_DEBUG'
 CHECKED_PER_SECTION = 100
@@ -78,7 +81,32 @@ class CheckedLock:
         return self._lock._is_owned()  # type: ignore[attr-defined, no-any-return]
 
 
-def engine_lock(check: Callable[[], None], size: Callable[[], int]) -> Any:
-    """Return the lock of an engine: a checked one if ``MDDAG_DEBUG`` asks for it."""
-    is_checked = os.environ.get(VARIABLE) in ('1', 'engine')
-    return CheckedLock(check, size) if is_checked else threading.RLock()
+@cache
+def _checks(path: str) -> Callable[[Any], Iterable[str]]:
+    """Return the function of a file that finds broken invariants."""
+    try:
+        found: Callable[[Any], Iterable[str]] = runpy.run_path(path)['broken_invariants']
+    except (OSError, KeyError, SyntaxError, UnicodeDecodeError) as error:
+        raise UsageError(
+            f'{VARIABLE}={path}: the value must be 1, or a Python file with a function '
+            f'broken_invariants: {error}') from None
+    return found
+
+
+def engine_lock(engine: Any, story: Callable[[], Iterable[str]]) -> Any:
+    """
+    Return the lock of an engine: a checked one if ``MDDAG_DEBUG`` asks for it.
+
+    :param story: returns what the threads have done before, for an ``InvariantError``.
+    """
+    path = os.environ.get(VARIABLE, '')
+    if path in ('', '0', '1'):
+        return threading.RLock()
+    broken_invariants, state = _checks(path), engine.scheduler.state
+
+    def check() -> None:
+        broken = [*broken_invariants(engine)]
+        if broken:
+            raise InvariantError([*broken, *story()])
+
+    return CheckedLock(check, lambda: len(state.job_dag) + len(state.x_state))

@@ -30,8 +30,8 @@ from mddag_executor.executor.bounds import (
     AGAIN_NS,
     LOOK_PART,
     NET_NS,
-    PATIENCE_NS,
     QUIET_NS,
+    SHORT_CALLBACK_NS,
     SOON_NS,
     STOP_NS,
 )
@@ -138,7 +138,7 @@ class DueTimes:
 
     def is_due(self, now: int) -> bool:
         """Return whether there is anything to ``handle``."""
-        return (self._timer.at <= now or self._agenda.first() <= now or self._timers.has_jumped)
+        return (self._timer.at <= now or self._agenda.next <= now or self._timers.has_jumped)
 
     def handle(self, now: int, since: int) -> None:
         """
@@ -241,9 +241,10 @@ class DueTimes:
 
         :param patience: how long what waits, or may come, may wait for it.
         """
-        watch = self._watch
-        at = min(self._agenda.first_latest(), now + patience)
-        if at < watch.at or watch.at < now + PATIENCE_NS:
+        watch, at = self._watch, now + patience
+        if self._agenda.latest < at:
+            at = min(self._agenda.first_latest(), at)
+        if at < watch.at or watch.at < now + SHORT_CALLBACK_NS:  # else it is good enough
             watch.arm(at)
 
     def has_looked(self, now: int) -> None:

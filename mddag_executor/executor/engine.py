@@ -36,14 +36,13 @@ that times never decrease.  The engine and ``other_processes`` change the core's
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.driven import ANSWERED, Awaiting, GUESSED
 from mddag_executor.core.estimates import note_time
-from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.jobs import due_of_answer, is_judged, judge_from
 from mddag_executor.core.overload import admit, is_late
 from mddag_executor.core.queues import (
@@ -51,7 +50,6 @@ from mddag_executor.core.queues import (
     has_place,
 )
 from mddag_executor.core.state import (
-    ALONE,
     ELSEWHERE,
     EXPIRED,
     IDLE,
@@ -70,7 +68,6 @@ from mddag_executor.executor.attribution import (
     Origin,
 )
 from mddag_executor.executor.bounds import NET_NS, SHORT_CALLBACK_NS
-from mddag_executor.executor.debugging import InvariantError
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.interpreter import has_waiting, Interpreter
 from mddag_executor.executor.other_processes import OtherProcesses
@@ -179,6 +176,9 @@ class Engine:
         self._bypassing_since = 0
         self._bypass_queue: deque[Work] = deque()
         self._last_id = -1
+        self._ready, self._held_back = self._state.ready, self._state.held_back
+        self._scalars = self._state.scalars
+        self._make_ready = self.scheduler.ready
         self._complete = self.scheduler.complete
         self._take = self.scheduler.take
         self._work: dict[int, Work] = {}
@@ -193,6 +193,8 @@ class Engine:
         # whether the ends of most executions only matter to the core
         self._is_plain = (
             record is None and self.path_watch is None and not self._optional_edges)
+        # whether the begin of an execution is to be noted
+        self._is_watched = bool(self.awaiting) or self.path_watch is not None
         #: whether ``publishes`` is to be called
         self.notes_publications = record is not None or self.path_watch is not None
         self._default_deadline = default_deadline
@@ -285,8 +287,6 @@ class Engine:
             if entity.callback is not None:
                 entity.unattributed += 1
             self.ready(work, now)
-        elif 0 < entity.depth < len(entity.waiting):
-            self._drop_oldest(entity, now)
 
     def ready(self, work: Work, now: int) -> None:
         """Handle undeclared work: a message, request, guard condition, waitable or task."""
@@ -376,9 +376,9 @@ class Engine:
 
     def _start_job(self, work: Work, release: int, now: int) -> None:
         dag = self.tables.dag_of[work.entity.source]
-        slot = self._release(dag, release, now)
-        work.origin = Origin(slot, dag, self._state.job_index[slot], work.entity.source)
-        self._start(work, self.scheduler.source(slot), now)
+        slot, state, source = self._release(dag, release, now), self._state, work.entity.source
+        work.origin = Origin(slot, dag, state.job_index[slot], source)
+        self._start(work, state.job_base[slot] + self.tables.region_offset[source], now)
 
     def _enter(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
         """Find or start the job of a message from another process (see ``other_processes``)."""
@@ -432,21 +432,20 @@ class Engine:
 
     def _start_successor(self, work: Work, origin: Origin, now: int) -> bool:
         """Make the vertex ready that a message of a known publication starts."""
-        entity = work.entity
-        target = entity.targets.get(origin.vertex)
-        if target is None:
+        entity, state = work.entity, self._state
+        slot, dag, job, before = origin
+        target = entity.targets.get(before)
+        if target is None or state.job_index[slot] != job or state.job_state[slot] != OPEN or (
+                state.job_dag[slot] != dag):
             return False
-        state = self._state
-        slot, dag, job, _ = origin
         vertex, leg = target
-        here = Origin(slot, dag, job, vertex)
-        if self.open_release(here) is None:
-            return False
-        x = self.scheduler.execution(slot, vertex, leg)
+        x = state.job_base[slot] + self.tables.region_offset[vertex] + leg
         if state.x_state[x] != IDLE:
             return False  # a second message for the same vertex of the same job
-        work.origin = here
+        work.origin = Origin(slot, dag, job, vertex)
         self._start(work, x, now)
+        if 0 < entity.depth < len(entity.waiting):
+            self._drop_oldest(entity, now)
         return True
 
     def _start(self, work: Work, x: int, now: int) -> None:
@@ -454,7 +453,9 @@ class Engine:
         state.x_group[x] = entity.group
         state.x_outer[x] = entity.outer
         state.x_holds[x] = entity.habit.holds
-        self._end_bypass().ready(x, now)
+        if self._is_bypassed:
+            self._end_bypass()
+        self._make_ready(x, now)
         work.x = x
         work.ready_ns = now
         entity.ready += 1
@@ -523,92 +524,116 @@ class Engine:
         :param worker: the worker to use if it is idle; else the lowest idle one is used.
         :param others_wait: whether a thread waits for events, which can start more at once.
         """
-        step, state, holders = self._step, self._state, self._holders
-        step.overtaken = None
-        step.deadline = self.deadlines.next
-        if self._bypass_queue or state.ready or state.held_back:
+        step, ready, held_back = self._step, self._ready, self._held_back
+        deadline = self.deadlines.next
+        if ready or held_back or self._bypass_queue:
             work = step.work = self._dispatch(worker, now)
-            waits = bool(self._bypass_queue or state.ready or state.held_back)
+            waits = bool(ready or held_back or self._bypass_queue)
         else:
             work = step.work = None
             waits = False
-        if work is None:
-            step.is_short = False
-            if step.deadline < NEVER:
-                step.deadline = self.deadlines.first()
+        if work is not None:
+            is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
         else:
-            step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
-        if holders:
-            holder = step.holder = holders[-1]
-            if holder is work and len(holders) > 1 and self.interpreter.pauses:
-                step.overtaken = holders[-2]
-        else:
-            step.holder = None
-        step.n_idle = state.scalars[N_IDLE]
-        if self._bypassing is not None:
-            step.n_idle -= 1
+            is_short = False
+            if deadline < NEVER:
+                deadline = self.deadlines.first()
+        step.is_short = is_short
+        step.deadline = deadline
+        self._note_holders(step, work)
+        step.n_idle = self._scalars[N_IDLE] - (self._bypassing is not None)
         if waits:
-            self._advise(step, now, others_wait or not step.is_short)
+            self._advise(step, now, others_wait or not is_short)
         else:
             step.more = False
             step.patience_ns = NET_NS
         return step
 
-    def look(self, now: int, asks: bool = True) -> Step:
-        """
-        Return what other threads are to do, after all events up to now.
-
-        :param asks: whether one of them can start ``more``.
-        """
+    def look(self, now: int) -> Step:
+        """Return what other threads are to do, after all events up to now."""
         step = self._step
-        step.work = step.overtaken = None
+        step.work = None
         step.is_short = step.more = False
-        step.holder = self._holders[-1] if self._holders else None
         step.deadline = self.deadlines.next
+        self._note_holders(step, None)
         step.n_idle = self.idle_workers
         step.patience_ns = NET_NS
         if self.has_waiting:
-            self._advise(step, now, asks)
+            self._advise(step, now, True)
         return step
 
+    def patience(self) -> int:
+        """
+        Return how long what waits, or may come, may wait for a short execution to end, ns.
+
+        NEVER: no worker is idle.
+        """
+        if self._scalars[N_IDLE] <= (self._bypassing is not None):
+            return NEVER
+        patience = self.interpreter.patience() if self.has_waiting else NET_NS
+        # it is not known yet whether a holder really computes: half the time
+        return patience // 2 if self._holders else patience
+
+    def _note_holders(self, step: Step, work: Work | None) -> None:
+        """Set what a step says about who holds the interpreter."""
+        holders = self._holders
+        step.holder = step.overtaken = None
+        if holders:
+            holder = step.holder = holders[-1]
+            if holder is work and len(holders) > 1 and self.interpreter.pauses:
+                step.overtaken = holders[-2]
+
     def _advise(self, step: Step, now: int, asks: bool) -> None:
-        """Set what a step says about other threads, as something waits."""
+        """
+        Set what a step says about other threads, as something waits.
+
+        :param asks: whether one of them can start ``more``.
+        """
         step.patience_ns = self.interpreter.patience()
         step.more = asks and self._may_start_more(now)
 
     def _dispatch(self, worker: int, now: int) -> Work | None:
-        work = None
         if self._is_bypassed:
-            if not self._bypass_queue:
+            work = self._dispatch_past_core(worker, now)
+            if work is not None or self._is_bypassed:
+                return work
+        state = self._state
+        if state.worker_x[worker] >= 0:
+            if not self._scalars[N_IDLE]:
                 return None
-            entity = self._bypass_queue[0].entity
-            if (self._bypassing is None and entity.wall_ns <= SHORT_CALLBACK_NS
-                    and entity.gate is None):
-                work = self._bypassing = self._bypass_queue.popleft()
-                self._bypassing_since = now
-                del entity.waiting[work.x]
-                work.x = -1
-                work.worker = worker
-            else:
-                self._end_bypass()
-        if work is None:
-            state = self._state
-            if not (state.ready or state.held_back):
-                return None
-            if state.worker_x[worker] >= 0:
-                if not state.scalars[N_IDLE]:
-                    return None
-                worker = state.worker_x.index(-1)
-            if self._holders:
-                state.overtaking[1] = self.interpreter.may_be_overtaken(now)
-            work = self._start_next(worker, now)
-            if work is None:
-                return None
-            entity = work.entity
-        if entity.collect_more is not None:
-            collect, entity.collect_more = entity.collect_more, None
-            collect()
+            worker = state.worker_x.index(-1)
+        if self._holders:
+            state.overtaking[1] = self.interpreter.may_be_overtaken(now)
+        work = self._start_next(worker, now)
+        if work is not None and work.entity.collect_more is not None:
+            self._collect_more(work.entity)
         return work
+
+    def _dispatch_past_core(self, worker: int, now: int) -> Work | None:
+        """Start the first execution that bypasses the core, or end the bypass."""
+        queue = self._bypass_queue
+        if not queue:
+            return None
+        entity = queue[0].entity
+        if self._bypassing is not None or entity.wall_ns > SHORT_CALLBACK_NS or (
+                entity.gate is not None):
+            self._end_bypass()
+            return None
+        work = self._bypassing = queue.popleft()
+        self._bypassing_since = now
+        del entity.waiting[work.x]
+        work.x = -1
+        work.worker = worker
+        if entity.collect_more is not None:
+            self._collect_more(entity)
+        return work
+
+    @staticmethod
+    def _collect_more(entity: Entity) -> None:
+        """Let the rest of its arrivals be collected, as one of its executions has started."""
+        collect, entity.collect_more = entity.collect_more, None
+        if collect is not None:
+            collect()
 
     def _start_next(self, worker: int, now: int) -> Work | None:
         """Start the execution that the core chooses for an idle worker; None: there is none."""
@@ -619,18 +644,24 @@ class Engine:
         if x < 0:
             return None
         work = self._work.pop(x)
-        work.entity.waiting.pop(x, None)  # one that goes on was removed before
+        entity = work.entity
+        entity.waiting.pop(x, None)  # one that goes on was removed before
         work.worker = worker
-        work.paused_ns = 0
+        if state.x_holds[x]:
+            work.paused_ns = 0
+            self._holders.append(work)
+        if self._is_watched:
+            self._begin_watched(work, now)
+        return work
+
+    def _begin_watched(self, work: Work, now: int) -> None:
+        """Note the start of an execution that may answer, or belongs to a path."""
         if work.entity.awaiting is not None and work.answers is None:
             self._begin_driven(work, work.entity.awaiting)
-        if state.x_holds[x]:
-            self._holders.append(work)
         if self.path_watch is not None:
             begun = work.origin or work.answers
             if begun is not None:
                 self.path_watch.begun(work, begun.vertex, now)
-        return work
 
     def _begin_driven(self, work: Work, awaiting: Awaiting[Origin]) -> None:
         """Note the start of an execution of a driven sync: which job it may answer."""
@@ -1050,49 +1081,6 @@ class Engine:
         self.deadlines.judge(now)
         if self._state.decisions:
             self._decided(now)
-
-    # --- debugging -------------------------------------------------------------------------------
-
-    def size(self) -> int:
-        """Return the number of jobs and executions that ``validate`` checks."""
-        return len(self._state.job_dag) + len(self._state.x_state)
-
-    def validate(self) -> None:
-        """Raise InvariantError if an invariant that holds between two calls is violated."""
-        broken = [
-            *broken_invariants(self.tables, self._state), *self.deadlines.broken_invariants(),
-            *self._broken_invariants()]
-        if broken:
-            raise InvariantError(broken)
-
-    def _broken_invariants(self) -> Iterator[str]:
-        state = self._state
-        if state.decisions:
-            yield f'the decisions {state.decisions} were not carried out'
-        for x, work in self._work.items():
-            if work.x != x or state.x_state[x] not in (WAITING, ALONE, SUSPENDED):
-                yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
-            elif (x in work.entity.waiting) != (state.x_started[x] < 0):
-                yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
-        if (self._is_bypassed or self._bypass_queue or self._bypassing) and not (
-                self._is_bypassed and self._is_core_empty()):
-            yield 'executions bypass the core, which has others'
-        known = {**self._work, **{work.x: work for work in self._bypass_queue}}
-        for entity in {work.entity for work in known.values()}:
-            if any(x not in known or known[x].entity is not entity for x in entity.waiting):
-                yield f'{[*entity.waiting]} are not all executions of one entity that wait'
-            if not entity.keeps_oldest and 0 < entity.depth < len(entity.waiting):
-                yield (f'{len(entity.waiting)} executions wait in a queue of depth '
-                       f'{entity.depth}')
-        if len(self._work) != sum(map(state.x_state.count, (WAITING, ALONE, SUSPENDED))):
-            yield f'of what waits or is suspended, work is known of {sorted(self._work)} only'
-        holding = sorted(x for x in state.worker_x if x >= 0 and state.x_holds[x])
-        if sorted(work.x for work in self._holders) != holding:
-            yield f'executions {holding} hold the GIL, noted are {[w.x for w in self._holders]}'
-            return
-        keys = [state.x_key[work.x][0] for work in self._holders]
-        if any(after >= before for before, after in zip(keys, keys[1:])):
-            yield f'the GIL was overtaken by something that is not more urgent: {keys}'
 
     # --- the end ---------------------------------------------------------------------------------
 

@@ -39,6 +39,10 @@ class Interpreter:
         self._state = state
         self.holders: list[Work] = []
         self.pauses = False
+        # by vertex: see ``patience``
+        self._patience = [
+            min(PATIENCE_NS, max(2 * SHORT_CALLBACK_NS, offset // PATIENCE_PART))
+            for offset in tables.rad_offset]
 
     @property
     def holder(self) -> Work | None:
@@ -56,12 +60,11 @@ class Interpreter:
 
     def patience(self) -> int:
         """Return how long what is ready may wait for a callback that was expected to end, ns."""
-        ready = self._state.ready
-        vertex = self._tables.n_vertices
-        if ready:
-            vertex = self._state.x_vertex[first_of(self._state, ready[0])]
-        return min(PATIENCE_NS, max(
-            2 * SHORT_CALLBACK_NS, self._tables.rad_offset[vertex] // PATIENCE_PART))
+        state = self._state
+        if not state.ready:
+            return self._patience[-1]
+        queue = state.ready[0][4]
+        return self._patience[state.x_vertex[state.queue_first[queue] if queue >= 0 else ~queue]]
 
     def may_be_overtaken(self, now: int) -> bool:
         """Return whether the first waiting execution may overtake the latest holder."""

@@ -236,7 +236,8 @@ class TimerFd:
         """
         self.at = at
         # the system call knows no negative times, and 0 stands for none
-        self._time[2:] = array('q', divmod(max(1, at), 1_000_000_000) if at < NEVER else (0, 0))
+        fields = self._time
+        fields[2], fields[3] = divmod(at if at > 0 else 1, 1_000_000_000) if at < NEVER else (0, 0)
         # 1: TFD_TIMER_ABSTIME
         if _timer_settime(self.fd, 1, self._address, None) != 0 and self.fd >= 0:
             raise OSError(f'timerfd_settime does not accept {self._time[2:].tolist()}')

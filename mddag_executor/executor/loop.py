@@ -101,7 +101,8 @@ class EventLoop:
         self._leave = new_eventfd()
         self._epoll.register(self.timer.fd, _EDGE)
         self._epoll.register(self._bell, _EDGE)
-        self._channels: dict[int, tuple[ChannelSource, ...]] = {}
+        #: the sources of each descriptor
+        self.channels: dict[int, tuple[ChannelSource, ...]] = {}
         self._shared: dict[str, int] = {}
         # a quarter of the descriptors that the process may open
         soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
@@ -120,32 +121,32 @@ class EventLoop:
 
         :param share: sources with the same name share one descriptor, as they are seldom used.
         """
-        if not share and len(self._channels) >= self._budget:
+        if not share and len(self.channels) >= self._budget:
             share = 'the rest'
         source.is_counted = not share
         if share in self._shared:
             source.fd = self._shared[share]
-            self._channels[source.fd] += (source,)
+            self.channels[source.fd] += (source,)
             return
         source.fd = self._free.pop() if self._free else new_eventfd()
         if share:
             self._shared[share] = source.fd
-        self._channels[source.fd] = (source,)
+        self.channels[source.fd] = (source,)
         self._epoll.register(source.fd, _EDGE)
 
     def add_own(self, source: ChannelSource) -> None:
         """Wait for a source that has its own descriptor."""
-        self._channels[source.fd] = (source,)
+        self.channels[source.fd] = (source,)
         self._epoll.register(source.fd, _EDGE)
 
     def remove(self, source: ChannelSource) -> None:
         """Forget a source whose listener has been cleared."""
         fd, source.fd = source.fd, -1
-        rest = tuple(each for each in self._channels[fd] if each is not source)
+        rest = tuple(each for each in self.channels[fd] if each is not source)
         if rest:
-            self._channels[fd] = rest
+            self.channels[fd] = rest
             return
-        del self._channels[fd]
+        del self.channels[fd]
         self._epoll.unregister(fd)
         self._shared = {name: each for name, each in self._shared.items() if each != fd}
         self._free.append(fd)
@@ -174,7 +175,7 @@ class EventLoop:
     def sources(self, events: Events) -> Iterator[ChannelSource]:
         """Yield the sources with arrivals."""
         for fd, _ in events:
-            yield from self._channels.get(fd, ())
+            yield from self.channels.get(fd, ())
 
     def wake(self) -> None:
         """Wake one waiting thread; from any thread, also after ``close``."""

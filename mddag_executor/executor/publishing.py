@@ -14,10 +14,10 @@ guard conditions are wrapped once for the process, when the first executor is ma
     as well.
 3.  *Delivery within the process.*  A middleware that delivers within a process does so inside
     ``publish``: the message can be taken when that returns.  The publishing thread takes the
-    message itself instead of waking a worker.  The descriptors of this process's subscriptions on
-    the topic are switched off while it publishes.  Then it takes the announced messages, and
-    switches the descriptors on again.  Other publishers have no effect: any other arrival wakes a
-    worker.
+    message itself instead of waking a worker.  If a thread waits for events, the descriptors of
+    this process's subscriptions on the topic are switched off while it publishes.  Then it takes
+    the announced messages, and switches the descriptors on again.  Other publishers have no
+    effect: any other arrival wakes a worker.
 4.  A thread that publishes while it owns the engine's lock (a signal handler can) leaves the
     message to a worker.
 5.  *A new content filter* makes rmw_fastrtps replace the subscription's reader, which loses the
@@ -37,7 +37,7 @@ from typing import Any
 from mddag_executor.executor.attribution import NO_ORIGIN, Publication, PublisherState
 from mddag_executor.executor.compat import GUARD_HANDLE
 from mddag_executor.executor.listeners import announce_trigger
-from mddag_executor.executor.work import current
+from mddag_executor.executor.work import current, Runner
 from rclpy.client import Client
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -51,20 +51,19 @@ class LocalDelivery:
     :param pool: the ``WorkerPool``.
     """
 
-    __slots__ = ('sources', '_pool', '_is_muted')
+    __slots__ = ('sources', 'pool', '_is_muted')
 
     def __init__(self, sources: tuple[Any, ...], pool: Any) -> None:
         self.sources = sources
-        self._pool = pool
+        self.pool = pool
         self._is_muted = False
 
     def mute(self) -> None:
-        """Pause announcements, if a thread waits for them, or may look for them."""
-        if self._pool.has_idle_threads():
-            try:
-                self._pool.loop.mute(self.sources)
-            finally:
-                self._is_muted = True  # last: a thread that ends it meanwhile may be too early
+        """Pause announcements, as a thread waits for them."""
+        try:
+            self.pool.loop.mute(self.sources)
+        finally:
+            self._is_muted = True  # last: a thread that ends it meanwhile may be too early
 
     def listen_again(self, subscription: Any) -> None:
         """Announce a subscription again after the middleware has replaced its reader."""
@@ -72,10 +71,15 @@ class LocalDelivery:
             if source.rclpy_object is subscription:
                 source.listen_again()
 
-    def collect_published(self, publication: Publication | None) -> None:
-        """Collect arrivals announced since ``mute``, and resume announcements."""
-        pool = self._pool
-        running = current.running
+    def collect_published(
+        self, publication: Publication | None, running: Runner | None
+    ) -> None:
+        """
+        Collect the arrivals announced since a publication began, and resume announcements.
+
+        :param running: what runs the callback that has published; None: it was none of ours.
+        """
+        pool = self.pool
         if running is None or running.pool is not pool:
             publication = None  # of another executor, with other jobs
         if not pool.is_inside():
@@ -146,9 +150,10 @@ def state_of(publisher: Any) -> PublisherState:
     return state
 
 
-def _send(original: Any, publisher: Any, msg: Any, state: PublisherState) -> Publication | None:
+def _send(
+    original: Any, publisher: Any, msg: Any, state: PublisherState, running: Runner | None
+) -> Publication | None:
     """Publish; return the publication if a callback published on a trigger topic."""
-    running = current.running
     topic = None
     if running is not None:
         running.publishes(state, msg)
@@ -189,21 +194,23 @@ def install() -> None:
 
     def publish(self: Any, msg: Any) -> None:
         state = self.__dict__.get(_STATE) or state_of(self)
+        running = current.running
         deliveries = _deliveries.get(state.topic)
         if deliveries is None:
-            if current.running is None and not state.is_tracked:
+            if running is None and not state.is_tracked:
                 send(self, msg)
             else:
-                _send(send, self, msg, state)
+                _send(send, self, msg, state, running)
             return
         publication = None
         try:  # an interrupt at any place must not leave the descriptors switched off
             for delivery in deliveries:
-                delivery.mute()
-            publication = _send(send, self, msg, state)
+                if delivery.pool.polling:
+                    delivery.mute()
+            publication = _send(send, self, msg, state, running)
         finally:
             for delivery in deliveries:
-                delivery.collect_published(publication)
+                delivery.collect_published(publication, running)
 
     def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
         running = current.running

@@ -101,7 +101,7 @@ class SubscriptionEntity(ArrivalEntity):
     list_name = 'subscriptions'
     is_known_to_caret = True
 
-    __slots__ = ('_gaps', '_with_info', '_is_plain')
+    __slots__ = ('_gaps', '_with_info', '_is_plain', '_is_successor')
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
@@ -126,7 +126,10 @@ class SubscriptionEntity(ArrivalEntity):
         self._gaps = Gaps(
             partial(rooms.publishers, subscription), partial(compat.publisher_count, subscription))
         self._with_info = compat.callback_type(subscription) is compat.WITH_INFO
-        self._is_plain = pool.engine.record is None and self.callback is None and not self.is_own
+        # of no job; or only of jobs that are known by the publication
+        may_be_plain = pool.engine.record is None and not self.is_own
+        self._is_plain = may_be_plain and self.callback is None
+        self._is_successor = may_be_plain and self.source < 0 and bool(self.targets)
         self.listen_in(rooms, pool.loop)
         if self.is_counted:
             rooms.deliveries.add(self)
@@ -165,6 +168,8 @@ class SubscriptionEntity(ArrivalEntity):
         work = Work(self, self.rclpy_object.callback, taken if self._with_info else (taken[0],))
         if self._is_plain:
             pool.engine.ready(work, pool.now)
+        elif publication is not None and self._is_successor:
+            pool.engine.arrived(work, publication.origin, -1, -1, pool.now)
         else:
             self._post_known(work, taken[1], publication)
 

@@ -212,9 +212,10 @@ class WorkerThread:
         end = monotonic_ns()
         self.start, self.end = start + pool.offset, end + pool.offset
         wall = end - start - self.paused_ns
-        if (measurement is None and not self.published
-                and entity.wall_ns <= SHORT_CALLBACK_NS >= wall):
+        if measurement is None and wall <= SHORT_CALLBACK_NS >= entity.wall_ns:
             habit.rests -= 1  # an average of short executions stays short without a measurement
+            if self.published:
+                entity.tail_ns += (end - self.published - entity.tail_ns) >> 3
         else:
             self._note_times(work, measurement, wall)
         if pool.callback_ended is not None and not isinstance(self.outcome, BaseException):

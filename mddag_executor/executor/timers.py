@@ -166,7 +166,9 @@ class TimerEntity(ListenerEntity):
         callback = self.rclpy_object.callback
         if callback is None:
             return None
-        return Work(self, with_timer_info(self.rclpy_object, callback, info))
+        if info is not None:
+            callback = with_timer_info(self.rclpy_object, callback, info)
+        return Work(self, callback)
 
 
 class TimerQueue:

@@ -104,12 +104,13 @@ class WorkerPool:
         self.clock = clock
         self.offset = clock.offset_ns
         # reentrant only to know its owner: a signal handler may run inside
-        self.lock = engine_lock(self._validate, engine.size)
+        self.lock = engine_lock(engine, self._story)
         # the last changes of threads: time, name, and new state
         self._history = deque([(0, '', _PARKED)] * HISTORY, HISTORY)
         #: functions to call when the calling thread does not own the lock
         self.unlocked_calls: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
+        self._channels = self.loop.channels
         self.parking = Parking()
         self.announcements: Announced | None = None
         self.agenda = Agenda()
@@ -247,12 +248,7 @@ class WorkerPool:
             return
         running = current.running
         if running is not None and running.pool is self and running.is_short():
-            step = self.engine.look(self.now, asks=False)
-            if step.n_idle:
-                rest = step.patience_ns
-                # it is not known yet whether the holder really computes: half the time
-                self.due.arm_by(
-                    monotonic_ns() + (rest // 2 if step.holder is not None else rest))
+            self.due.arm_by(self.now - self.offset + self.engine.patience())
         else:
             self.wake_for(self.engine.look(self.now), self.now)
 
@@ -272,10 +268,6 @@ class WorkerPool:
         elif self._n_parked and not self._has_called:
             self._has_called = True
             self.parking.call()
-
-    def has_idle_threads(self) -> bool:
-        """Return whether any thread waits for events, or may look for them."""
-        return bool(self.polling or self._n_parked)
 
     def note_eager(self, entity: Entity) -> None:
         """Note whether a thread must wait for an entity's messages or requests, at any time."""
@@ -450,20 +442,13 @@ class WorkerPool:
             if found:
                 execute()
                 found = go_on(me)
-            elif me.state is ThreadState.PARKED:
+            elif me.state is _PARKED:
                 park()
                 if self._closed:
                     return
                 found = receive(me, None)
             else:
                 found = receive(me, wait())
-
-    def _validate(self) -> None:
-        """Check the engine; the error says what the threads have done before."""
-        try:
-            self.engine.validate()
-        except InvariantError as error:
-            raise InvariantError([*error.broken, *self._story()]) from None
 
     def _story(self) -> list[str]:
         return [f'{(at - self.now) / 1e6:+.3f} ms {name} {state.value}'
@@ -504,7 +489,7 @@ class WorkerPool:
             # inlined tick: saves a call for each execution
             now = self.now = monotonic_ns() + self.offset
             since = now
-            if me.state is ThreadState.WAITING:
+            if me.state is _WAITING:
                 since = me.waits_since
                 self._polled_at = now
             if events is None:
@@ -528,13 +513,15 @@ class WorkerPool:
 
         :param since: since when the calling thread has waited for them.
         """
-        for source in self.loop.sources(events):
-            if self.running:
-                source.collect()
-            else:
-                self.loop.announce(source)  # for the next spin
+        running = self.running
+        for fd, _ in events:
+            for source in self._channels.get(fd, ()):
+                if running:
+                    source.collect()
+                else:
+                    self.loop.announce(source)  # for the next spin
         # a recorded message is later than the turn began
-        if self.running and self.due.is_due(self.now - self.offset):
+        if running and self.due.is_due(self.now - self.offset):
             self.due.handle(self.now, since)
 
     def _look(self) -> None:
@@ -631,7 +618,7 @@ class WorkerPool:
                 self.lending.hand_over(step)
                 step = engine.step(me.worker, now, self.polling > 0)
         else:
-            step = engine.look(now, self.is_stepping)
+            step = engine.look(now)
         work = step.work
         if work is None:
             if step.deadline != due.overdue.deadline:
@@ -646,10 +633,22 @@ class WorkerPool:
             return False
         me.work = work
         me.worker = work.worker
-        self.become(me, _RUNNING)
+        if me.state is not _RUNNING:
+            self.become(me, _RUNNING)
         if step.overtaken is not None:
             self.pauses.begin(step.overtaken, me)
-        me.is_spare = not (step.is_short or step.holder is work)
+        if step.is_short and not self.polling and not self.is_stepping:  # nearly always
+            me.is_spare = False
+            if step.n_idle:
+                due.look_after(now - self.offset, step.patience_ns)
+        else:
+            self._share_events(me, step, now)
+        return True
+
+    def _share_events(self, me: WorkerThread, step: Step, now: int) -> None:
+        """Let another thread wait for events, or look for them, while one runs an execution."""
+        due = self.due
+        me.is_spare = not (step.is_short or step.holder is step.work)
         if step.deadline != due.overdue.deadline and (self.polling or not step.is_short):
             due.overdue.set(step.deadline)  # else there is time until it ends
         if self.is_stepping:
@@ -657,16 +656,13 @@ class WorkerPool:
         elif self.polling:
             if step.more:
                 self.call()
-            elif self.agenda.first() < self.loop.timer.at:
+            elif self.agenda.next < self.loop.timer.at:
                 due.arm(now - self.offset)
         elif step.n_idle:
-            if step.is_short:
-                due.look_after(now - self.offset, step.patience_ns)
-            elif me.is_spare or self._eager or step.more:
+            if me.is_spare or self._eager or step.more:
                 self.call()
             else:
                 due.look(now - self.offset)
-        return True
 
     def _rest(self, me: WorkerThread, step: Step) -> None:
         """Let a thread without an execution wait for events, or park it."""

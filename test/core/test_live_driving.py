@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import initialize, invariant, precondition, rule, RuleBasedStateMachine
 from mddag_executor.core import legs_of, NEVER, POLICIES, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
-from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.state import (
     COMPLETED,
     DROP,
@@ -35,6 +34,7 @@ from mddag_executor.core.state import (
 )
 
 from ..conftest import examples
+from ..invariants import broken_deadlines, broken_in_core
 from .task_sets import declaration, live, task_sets, TICK
 
 WAITING, RUNNING, SUSPENDED, REFUSED = 'waiting', 'running', 'suspended', 'refused'
@@ -338,7 +338,7 @@ class LiveDriver(RuleBasedStateMachine):
         if self.deadlines.first() < NEVER:  # what comes first is of a slot in use
             assert OPEN in self.state.job_state
         assert self.now <= self.deadlines.first() <= min(later, default=NEVER)
-        assert not [*self.deadlines.broken_invariants()]
+        assert not [*broken_deadlines(self.deadlines)]
 
     def due(self):
         """Return the deadlines of all sinks without a verdict."""
@@ -457,7 +457,7 @@ class LiveDriver(RuleBasedStateMachine):
 
     @invariant()
     def slots_are_accounted_for(self):
-        assert not [*broken_invariants(self.tables, self.state)]
+        assert not [*broken_in_core(self.tables, self.state)]
         open_slots = [job.slot for job in self.open_jobs()]
         assert sorted(open_slots) == [
             slot for slot, state in enumerate(self.state.job_state)

@@ -5,10 +5,11 @@
 import random
 
 from mddag_executor.core import Scheduler, Tables
-from mddag_executor.core.invariants import broken_invariants
 from mddag_executor.core.queues import has_place
 from mddag_executor.core.state import NO_PLACE, PLACED, RUNNING
 import pytest
+
+from ..invariants import broken_in_core
 
 GROUPS, LIMITS = 4, (0, 1, 1, 3, 1 << 30)
 
@@ -39,7 +40,7 @@ class Run:
         getattr(self, self.random.choice((
             'add', 'add', 'take', 'take', 'complete', 'lend', 'rejoin', 'suspend', 'resume',
             'open', 'drop', 'move', 'go_on')))()
-        assert [*broken_invariants(self.core.tables, self.state)] == []
+        assert [*broken_in_core(self.core.tables, self.state)] == []
 
     def add(self):
         if len(self.waiting) < 30:
@@ -150,7 +151,7 @@ def test_no_more_run_than_may_and_none_is_forgotten(seed):
             break
         for action in (run.rejoin, run.resume, run.take, run.complete):
             action()
-        assert [*broken_invariants(run.core.tables, run.state)] == []
+        assert [*broken_in_core(run.core.tables, run.state)] == []
     assert not (run.waiting or run.running)
     assert [*run.state.outer_running] == [0, 0, 0]
 
@@ -167,7 +168,7 @@ def test_one_that_goes_on_may_leave_its_outer_group():
     core.lend(x)
     core.rejoin(x, 0, 0, 2)
     core.set_outer(x, -1)
-    assert [*broken_invariants(core.tables, core.state)] == []
+    assert [*broken_in_core(core.tables, core.state)] == []
     core.go_on_without(x)
     assert [*core.state.outer_running] == [0, 0]
     y = core.ready_undeclared(0, -1, 0, core.new_queue(), 3)

@@ -10,8 +10,9 @@ from mddag_executor.core import NEVER, POLICIES
 from mddag_executor.core.jobs import source_depth
 from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
+from mddag_executor.errors import UsageError
 from mddag_executor.executor.attribution import Origin
-from mddag_executor.executor.debugging import InvariantError
+from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import GilCheck, GilHabit
@@ -21,12 +22,19 @@ import pytest
 
 from ..conftest import examples
 from ..core.task_sets import Case, cases, TICK
+from ..invariants import broken_invariants
 from .conftest import Spinning, wait_for
 from .declared import graph
 
 HORIZON = 60
 MS = 1_000_000
 
+
+
+def check(engine):
+    """Check the invariants that hold between two calls."""
+    broken = [*broken_invariants(engine)]
+    assert not broken, broken
 
 
 def new_engine(task_set=None, workers=1, policy='rad', **more):
@@ -94,7 +102,7 @@ class Driver:
                 _, dag, _, vertex = work.origin
                 ticks = self.case.ticks[dag][self.tables.index_in_dag[vertex]]
                 self.running[work.worker] = now + ticks * TICK, work
-            self.engine.validate()
+            check(self.engine)
 
     def complete(self, work, now):
         self.note(now, 'end', work)
@@ -133,7 +141,7 @@ def test_which_releases_of_a_timer_give_way_to_newer_ones(keys, release, dropped
     timer.depth = source_depth(engine.tables, engine.scheduler.state, 0)
     for due in range(0, 61 * MS, 20 * MS):
         engine.timer_due(Work(timer, print), due, due)
-        engine.validate()
+        check(engine)
     work = engine.step(0, 61 * MS).work
     assert engine.release_of(work) == release * MS
     assert (timer.dropped, timer.skipped) == (dropped, 0 if dropped else 2)
@@ -150,11 +158,11 @@ def test_a_sink_that_ended_in_time_is_in_time_also_if_it_was_reported_overdue(re
     engine.timer_due(Work(timer, print), 0, 0)
     work = engine.step(0, 30 * MS).work
     engine.judge_overdue(40 * MS + 1)
-    engine.validate()
+    check(engine)
     sink = engine.verdicts.tally.result()['dags']['/motor']['sinks']['/motor:drive']
     assert (sink['late'], sink['overdue'], sink['tolerate']['worst']) == (1, 1, 1)
     engine.finished(work, 30 * MS, 40 * MS, reported_at * MS, 0, 0)
-    engine.validate()
+    check(engine)
     result = engine.verdicts.tally.result()
     sink = result['dags']['/motor']['sinks']['/motor:drive']
     assert [miss.kind for miss in misses] == ['overdue']
@@ -187,7 +195,7 @@ class OneUser:
     def hear(self, origin, time):
         work = Work(self.user, print)
         self.engine.arrived(work, origin, -1, -1, time)
-        self.engine.validate()
+        check(self.engine)
         return work
 
 
@@ -248,7 +256,7 @@ class Robot:
             engine.finished(work, start, now, now, 0, 0)
             if work.entity is self.camera:
                 engine.arrived(Work(self.detector, print), origin, -1, -1, now)
-            engine.validate()
+            check(engine)
         return self.detections
 
     def fire(self, due, now):
@@ -307,7 +315,7 @@ def flooded(depths, tick_ms=2):
         if not is_tick:
             ran[entities.index(work.entity)].append((work.args[0], start))
         engine.finished(work, start, now, now, 0, 0)
-        engine.validate()
+        check(engine)
     return engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick'], ran
 
 
@@ -380,7 +388,7 @@ def test_messages_keep_their_order_when_their_callback_is_found_to_compute_no_mo
         engine.ready(message, 1)
         assert engine.step(1, 1).work is None
         user.habit.holds = 0
-        engine.validate()
+        check(engine)
     engine.finished(other, 1, 1, 1, 0, 0)
     assert [engine.step(worker, 1).work for worker in (0, 1)] == messages
 
@@ -443,7 +451,7 @@ def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
         while begun and engine.look(now).more and (len(begun) == 1 or begun[-1] is not None):
             begun.append(engine.step(0, now).work)
         running |= {work.worker: work for work in begun if work is not None}
-        engine.validate()
+        check(engine)
         if len(running) < engine.n_workers:
             assert not entities[0].waiting
             assert not entities[1].waiting or engine.interpreter.holders
@@ -589,7 +597,7 @@ class Steps:
                 self.suspended.append(work)
             elif step != 'lend':
                 engine.finished(work, now, now, now, 0, work.worker, step == 'fail')
-        engine.validate()
+        check(engine)
         return started
 
     def seen(self, started, now):
@@ -711,8 +719,8 @@ def test_each_broken_invariant_is_found(broken):
     engine = busy_engine()
     text, break_it = BREAKS[broken]
     break_it(engine)
-    with pytest.raises(InvariantError, match=text):
-        engine.validate()
+    with pytest.raises(AssertionError, match=text):
+        check(engine)
 
 
 def test_a_broken_invariant_ends_the_spin(make_executor, make_node):
@@ -725,3 +733,12 @@ def test_a_broken_invariant_ends_the_spin(make_executor, make_node):
         spinning.join()
         executor._engine._state.scalars[N_HOLDING] -= 1
     assert 'mddag-worker-' in str(spinning.error)  # what threads did before
+
+
+def test_checks_that_are_in_no_file_are_refused(monkeypatch, tmp_path):
+    engine, empty = new_engine(), tmp_path / 'empty.py'
+    empty.touch()
+    for value in ('engine', str(empty)):
+        monkeypatch.setenv('MDDAG_DEBUG', value)
+        with pytest.raises(UsageError, match=f'MDDAG_DEBUG={value}: '):
+            engine_lock(engine, list)

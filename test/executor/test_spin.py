@@ -469,7 +469,7 @@ publisher = node.create_publisher(String, '/command', 10)
 heard = Counter()
 node.create_subscription(
     String, '/command', lambda message: heard.update([message.data]), 10000)
-timer = node.create_timer(0.001, lambda: publisher.publish(String(data='job')))
+timer = node.create_timer(0.01, lambda: publisher.publish(String(data='job')))
 executor = MultiDeadlineExecutor(loads(sys.argv[2]))
 executor.add_node(node)
 stops = 0
@@ -513,6 +513,6 @@ print(stops, heard['stop'])
 def test_a_signal_s_handler_may_publish(where):
     """Whatever the main thread does when the signal comes: it holds locks now and then."""
     text = graph(node="""
-        name: tick, timer: 1ms, publishes: [/command]
+        name: tick, timer: 10ms, publishes: [/command]
         name: obey, subscription: /command, deadline: 1s""")
     assert run_program(PUBLISHES, where, text)[0] == '200 200\n'

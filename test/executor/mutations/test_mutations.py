@@ -215,14 +215,15 @@ self.due.has_looked(now - self.offset)
         'test_deadlines.py',
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('messages_go_to_the_oldest_open_job', [(
-        'executor/engine.py', 'slot, dag, job, _ = origin\n        vertex, leg = target', """\
+        'executor/engine.py', 'vertex, leg = target\n        x = ', """\
 vertex, leg = target
         dag = origin.dag
         job, slot = min((
             (state.job_index[i], i) for i, of in enumerate(state.job_dag)
             if of == dag and state.job_state[i] == OPEN and state.x_state[
                 state.job_base[i] + self.tables.region_offset[vertex] + leg] == IDLE),
-            default=(origin.job, origin.slot))""")], of(
+            default=(origin.job, origin.slot))
+        x = """)], of(
         'test_deadlines.py',
         'test_each_callback_runs_for_the_job_that_its_message_belongs_to')),
     Case('messages_go_to_the_job_before', [(

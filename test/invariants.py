@@ -1,15 +1,16 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Invariants of the state between two calls of the rules; for debugging.
+Invariants of the core's state and of the engine, between two calls.
 
-The rules themselves are in ``rules``, the queues in ``queues``, and jobs in ``jobs``.
+``MDDAG_DEBUG`` names this file while tests run: see ``mddag_executor.executor.debugging``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mddag_executor.core.jobs import next_deadline
 from mddag_executor.core.queues import first_of, has_place
 from mddag_executor.core.state import (
     ALONE,
@@ -33,8 +34,17 @@ from mddag_executor.core.tables import NEVER, Tables
 ACTIVE = (WAITING, ALONE, RUNNING, SUSPENDED)
 
 
-def broken_invariants(t: Tables, s: State) -> Iterator[str]:
-    """Yield a sentence for each invariant that does not hold."""
+def broken_invariants(engine):
+    """Yield a sentence for each invariant of an engine, and of its core, that does not hold."""
+    yield from broken_in_core(engine.tables, engine.scheduler.state)
+    yield from broken_deadlines(engine.deadlines)
+    yield from _executions(engine)
+
+
+# --- the core ------------------------------------------------------------------------------------
+
+def broken_in_core(t: Tables, s: State) -> Iterator[str]:
+    """Yield a sentence for each invariant of the core's state that does not hold."""
     yield from _heaps(s)
     yield from _queues(t, s)
     yield from _workers(s)
@@ -217,3 +227,48 @@ def _chain(links: list[int], first: int, most: int) -> list[int]:
         found.append(first)
         first = links[first]
     return found
+
+
+def broken_deadlines(deadlines):
+    """Yield a sentence for each invariant of the deadlines of open jobs that does not hold."""
+    t, s = deadlines._rule
+    if deadlines.next != (deadlines._heap[0][0] if deadlines._heap else NEVER):
+        yield f'the next deadline is not {deadlines.next}'
+    for slot, judged in deadlines._judged.items():
+        if s.job_state[slot] == OPEN:
+            time = next_deadline(t, s, slot, judged)
+            if deadlines._entry.get(slot, NEVER) > time:
+                yield f'no timer is set for the deadline {time} of the job in slot {slot}'
+
+
+# --- the engine ----------------------------------------------------------------------------------
+
+def _executions(engine):
+    """Check the executions that the engine knows."""
+    state = engine.scheduler.state
+    if state.decisions:
+        yield f'the decisions {state.decisions} were not carried out'
+    for x, work in engine._work.items():
+        if work.x != x or state.x_state[x] not in (WAITING, ALONE, SUSPENDED):
+            yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
+        elif (x in work.entity.waiting) != (state.x_started[x] < 0):
+            yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
+    if (engine._is_bypassed or engine._bypass_queue or engine._bypassing) and not (
+            engine._is_bypassed and engine._is_core_empty()):
+        yield 'executions bypass the core, which has others'
+    known = {**engine._work, **{work.x: work for work in engine._bypass_queue}}
+    for entity in {work.entity for work in known.values()}:
+        if any(x not in known or known[x].entity is not entity for x in entity.waiting):
+            yield f'{[*entity.waiting]} are not all executions of one entity that wait'
+        if not entity.keeps_oldest and 0 < entity.depth < len(entity.waiting):
+            yield f'{len(entity.waiting)} executions wait in a queue of depth {entity.depth}'
+    if len(engine._work) != sum(map(state.x_state.count, (WAITING, ALONE, SUSPENDED))):
+        yield f'of what waits or is suspended, work is known of {sorted(engine._work)} only'
+    holders = engine.interpreter.holders
+    holding = sorted(x for x in state.worker_x if x >= 0 and state.x_holds[x])
+    if sorted(work.x for work in holders) != holding:
+        yield f'executions {holding} hold the GIL, noted are {[w.x for w in holders]}'
+        return
+    keys = [state.x_key[work.x][0] for work in holders]
+    if any(after >= before for before, after in zip(keys, keys[1:])):
+        yield f'the GIL was overtaken by something that is not more urgent: {keys}'
