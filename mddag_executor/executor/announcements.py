@@ -53,13 +53,13 @@ from mddag_executor.executor.attribution import (
     PublisherNumbers,
     stamped_release,
 )
-from mddag_executor.executor.bounds import LOG_EVERY_S, REMEMBERED
+from mddag_executor.executor.bounds import REMEMBERED
+from mddag_executor.executor.hearing import Allowance, is_plausible
 from mddag_executor.executor.other_processes import contested
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.work import Work
 from msg_graph import TaskSet
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.logging import get_logger
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
@@ -71,12 +71,8 @@ WAIT_NS = 100_000_000
 """How long a message waits for its announcement; this is checked twice in that time."""
 _QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=1000)
-OLDEST_NS, LATEST_NS = 3_600_000_000_000, 1_000_000_000
-"""How long before now, and after it, the release of an announced job may be."""
 MOST_ENTRIES = 256
 """The most publications that are announced together: those of one topic that overlap."""
-SHARE, SAVED_NS = 20, 20_000_000
-"""Announcements get this part of a core (1 of ``SHARE``), and may save this time of it."""
 # sender, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
 SILENT = 2 ** 64 - 1
 """In place of a sequence number: the topic was not published in the job."""
@@ -104,10 +100,6 @@ class Announcements:
         # until when (trace's clock) each message waits, and its info from the middleware
         self._waiting: list[tuple[int, Work, dict[str, Any]]] = []
         self._checked_at = 0
-        # the CPU time that may be spent on announcements, and when it was last updated, ns
-        self._allowance = SAVED_NS
-        self._allowed_at = time.monotonic_ns()
-        self._warn_at = 0
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
         own = names.index(process)
@@ -121,8 +113,10 @@ class Announcements:
                 UInt8MultiArray, f'/mddag/jobs_{digest}/p{i}', self._hear, _QOS,
                 callback_group=ReentrantCallbackGroup())
             for i in range(len(names)) if i != own]
+        self._allowance = Allowance(
+            pool.unlocked_calls, self.subscriptions[0].topic_name if self._n_others else '')
         self._attribution.announce = self._announce
-        self._engine.on_silent = self._announce_silent
+        self._engine.on_silent.append(self._announce_silent)
 
     def unmatched(self) -> list[str]:
         """Return the topics on which the processes have not discovered each other."""
@@ -136,10 +130,11 @@ class Announcements:
 
     def close(self) -> None:
         """Stop announcing."""
-        self._attribution.announce = None
-        self._engine.on_silent = None
-        self._publisher = None
-        self.node.destroy_node()
+        if self._publisher is not None:
+            self._attribution.announce = None
+            self._engine.on_silent.remove(self._announce_silent)
+            self._publisher = None
+            self.node.destroy_node()
 
     def _announce(
         self, send: Callable[[Any, Any], None], topic: str, several: list[Publication]
@@ -162,8 +157,11 @@ class Announcements:
 
     def _announce_silent(self, origin: Origin, topic: str) -> None:
         """Announce that a vertex ends without a topic (rule 6); the engine's lock is held."""
-        job, publisher = self._job(origin), self._publisher
-        if job is not None and publisher is not None and topic not in self._contested:
+        others, publisher = self._engine.other_processes, self._publisher
+        if others is None or not others.is_announced(origin) or topic in self._contested:
+            return
+        job = self._job(origin)
+        if job is not None and publisher is not None:
             (home, number), release = job
             entry = _ENTRY.pack(
                 self._token, 0, SILENT, 0, 0, home, number, release, origin.dag, origin.vertex,
@@ -189,7 +187,7 @@ class Announcements:
     def _hear(self, message: UInt8MultiArray) -> None:
         """Handle announcements of another process; pass on the messages that waited for them."""
         size, rest = divmod(len(message.data), _ENTRY.size)
-        if rest or size > MOST_ENTRIES or not self._may_hear():
+        if rest or size > MOST_ENTRIES or not self._allowance.has_time():
             return
         begin = time.thread_time_ns()
         for entry in _ENTRY.iter_unpack(message.data):
@@ -207,23 +205,7 @@ class Announcements:
             if origin is not None:
                 self._waiting.remove(entry)
                 self._give(entry[1], origin)
-        self._allowance -= time.thread_time_ns() - begin
-
-    def _may_hear(self) -> bool:
-        """Return whether announcements have taken no more than their share of the time."""
-        before, now = self._allowed_at, time.monotonic_ns()
-        self._allowed_at = now
-        self._allowance = min(SAVED_NS, self._allowance + (now - before) // SHARE)
-        if self._allowance > 0:
-            return True
-        if now > self._warn_at:
-            self._warn_at = now + int(LOG_EVERY_S * 1e9)
-            self._pool.unlocked_calls.append(partial(
-                get_logger('mddag_executor').warning,
-                'announcements of jobs are ignored: more arrive than the executors of the '
-                'declared processes can send; another program publishes on '
-                f'{self.subscriptions[0].topic_name} or its siblings'))
-        return False
+        self._allowance.spend(time.thread_time_ns() - begin)
 
     def _is_plausible(self, release: int, dag: int, vertex: int, topic: int) -> bool:
         """Return whether an announcement may be true: it comes from outside."""
@@ -232,9 +214,8 @@ class Announcements:
         if dag < 0:  # a publication of no job
             return True
         first = self._engine.tables.first_vertex
-        now = self._allowed_at
         return (dag < len(self._engine.dag_names) and first[dag] <= vertex < first[dag + 1]
-                and now - OLDEST_NS <= release <= now + LATEST_NS)
+                and is_plausible(release, self._allowance.updated_at))
 
     def _give(self, work: Work, origin: Origin | Announced | None) -> None:
         """Pass on a message after a possible wait for its announcement."""

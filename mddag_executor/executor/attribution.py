@@ -62,13 +62,14 @@ class Announced(NamedTuple):
     """
     What another process announces about a publishing execution.
 
-    :ivar name: of its job: the process that first released it, and its number there.
+    :ivar name: of its job: the process that first released it, and its number there; or the
+        header stamp that identifies it.
     :ivar dag: its index, -1: none.
     :ivar vertex: the global vertex.
     :ivar release: of the job, on the machine's steady clock in ns.
     """
 
-    name: tuple[int, int]
+    name: int | tuple[int, int]
     dag: int
     vertex: int
     release: int

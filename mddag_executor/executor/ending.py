@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mddag_executor.executor.diagnostics import Diagnostics
     from mddag_executor.executor.misses import MissNotifier
     from mddag_executor.executor.recorder import Recorder
+    from mddag_executor.executor.silences import Silences
     from mddag_executor.executor.upkeep import Upkeep
     from mddag_executor.executor.waitables import WaitSetThread
     from mddag_executor.executor.workers import WorkerPool
@@ -51,7 +52,7 @@ class Ending:
         self.wait_sets: WaitSetThread | None = None
         self.upkeep: Upkeep | None = None
         self.diagnostics: Diagnostics | None = None
-        self.announcements: Announcements | None = None
+        self.announcements: list[Announcements | Silences] = []
         self._pool = pool
         self._at_once = at_once
         self._signals = signals
@@ -75,8 +76,8 @@ class Ending:
                 each.stop()
         if self.upkeep is not None:
             self.upkeep.clear()
-        if self.announcements is not None:
-            self.announcements.close()
+        for announcements in self.announcements:
+            announcements.close()
         try:
             self._pool.end_coroutines()
         finally:
@@ -128,6 +129,6 @@ class Ending:
     def undo(self) -> None:
         """Free everything again, as the executor could not be made."""
         self._has_ended = self.is_asked = True
-        if self.announcements is not None:
-            self.announcements.close()
+        for announcements in self.announcements:
+            announcements.close()
         self._close_descriptors()

@@ -154,8 +154,8 @@ class Engine:
             if each.callback.driven_by is not None:
                 self._driven.setdefault(each.callback.key, []).append(number)
                 self.awaiting.setdefault(each.callback.key, Awaiting(each.callback))
-        #: Announces that a vertex ends without a topic that starts one in another process.
-        self.on_silent: Callable[[Origin, str], None] | None = None
+        #: Each is called when a vertex ends without a topic that starts one in another process.
+        self.on_silent: list[Callable[[Origin, str], None]] = []
         admit(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
             task_set, self.tables, self.scheduler, self.attribution, process)
@@ -941,8 +941,9 @@ class Engine:
         if not failed and pending >= 0:
             for after, topic in self._optional_edges[vertex]:
                 if topic not in published:
-                    if self.on_silent is not None and self._state.expected[after] == ELSEWHERE:
-                        self.on_silent(origin, topic)
+                    if self._state.expected[after] == ELSEWHERE:
+                        for announce in self.on_silent:
+                            announce(origin, topic)
                     self.scheduler.withhold(slot, vertex, after, now)
         return published
 

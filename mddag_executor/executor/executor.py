@@ -57,6 +57,7 @@ from mddag_executor.executor.shutdown import (
     halt_at_exit,
     is_over,
 )
+from mddag_executor.executor.silences import may_be_silent, Silences
 from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.statistics import statistics
 from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, watched
@@ -243,18 +244,20 @@ class MultiDeadlineExecutor(BareExecutor):
         if process is not None and task_set is not None and (
                 self._engine.other_processes is not None
                 and self._engine.other_processes.announces):
-            self._announcements = self._ending.announcements = Announcements(
-                task_set, process, self._pool)
+            self._announcements = Announcements(task_set, process, self._pool)
+            self._ending.announcements.append(self._announcements)
             self._pool.announcements = self._announcements
-            self._registry.own = {*self._announcements.subscriptions}
+        if task_set is not None and may_be_silent(task_set, process):
+            self._ending.announcements.append(Silences(task_set, self._pool))
+        self._registry.own = {
+            each for several in self._ending.announcements for each in several.subscriptions}
         # Otherwise ready callbacks would run before the spin notices.
         call_at_shutdown(self.context, self._pool.start_no_more)
         call_at_shutdown(self.context, self._context_ends)
         halt_at_exit(self)
 
     def _nodes_to_serve(self) -> list[Any]:
-        nodes: list[Any] = list(self.get_nodes())
-        return nodes if self._announcements is None else [*nodes, self._announcements.node]
+        return [*self.get_nodes(), *(each.node for each in self._ending.announcements)]
 
     def _context_ends(self) -> None:
         """Note whether a callback of this executor ends the context."""

@@ -22,9 +22,9 @@ For such DAGs only:
     starts one, whose release is the stamp.  If publications are announced, the announcement gives
     its job and vertex.
 4.  The job of a stamp is the one that a source's message or an entering message with that stamp
-    has started here, or one of whose callbacks here has published a message with that stamp.  The
-    job of an announced name is the one that was released here or has entered by that name.  So a
-    DAG may leave a process and come back.
+    has started here, or one of whose callbacks here has published a message with that stamp, or
+    that a *silence* has started (``silences``).  The job of an announced name is the one that was
+    released here or has entered by that name.  So a DAG may leave a process and come back.
 5.  An ambiguous message (two vertices elsewhere that publish the topic, no stamp, a job that has
     ended, a second message for the same vertex of the same job) runs as undeclared, and is counted
     as unattributed.
@@ -81,6 +81,8 @@ class OtherProcesses:
         self._jobs: dict[tuple[int, int | tuple[int, int]], Origin] = {}
         self._kept: deque[tuple[int, int | tuple[int, int]]] = deque()
         self._names: dict[tuple[int, int], tuple[int, int]] = {}
+        # by DAG and job: its first stamp
+        self._stamps: dict[tuple[int, int], int] = {}
 
     @staticmethod
     def of(
@@ -174,6 +176,8 @@ class OtherProcesses:
             self._names[origin.dag, origin.job] = name
         elif name < 0 or origin.dag not in self._crossing:
             return
+        else:
+            self._stamps.setdefault((origin.dag, origin.job), name)
         key = (origin.dag, name)
         if key not in self._jobs:
             self._kept.append(key)
@@ -181,6 +185,7 @@ class OtherProcesses:
                 gone = self._jobs.pop(self._kept.popleft(), None)
                 if gone is not None:
                     self._names.pop((gone.dag, gone.job), None)
+                    self._stamps.pop((gone.dag, gone.job), None)
         self._jobs[key] = origin
 
     def find(self, dag: int, name: int | tuple[int, int]) -> Origin | None:
@@ -190,6 +195,19 @@ class OtherProcesses:
     def name_of(self, origin: Origin) -> tuple[int, int] | None:
         """Return the name of a job, None if it has none yet."""
         return self._names.get((origin.dag, origin.job))
+
+    def stamp_of(self, origin: Origin) -> int | None:
+        """Return the header stamp that identifies a job elsewhere; None: it has none yet."""
+        return self._stamps.get((origin.dag, origin.job))
+
+    def is_announced(self, origin: Origin) -> bool:
+        """Return whether the job of a publication is announced."""
+        return origin.dag in self._announced
+
+    def is_stamped(self, dag: int, vertex: int) -> bool:
+        """Return whether a DAG is identified by stamps, and has a vertex."""
+        return dag in self._crossing and (
+            0 <= vertex < len(self._callbacks) and self._tables.dag_of[vertex] == dag)
 
 
 def contested(task_set: TaskSet) -> set[str]:

@@ -18,6 +18,8 @@ from mddag_executor.executor.attribution import (
     PublisherState,
     ROUNDING_NS,
 )
+from mddag_executor.executor.silences import _ENTRY as _SILENCE
+from mddag_executor.executor.silences import Silences
 from msg_graph import loads
 import pytest
 from std_msgs.msg import Header, UInt8MultiArray
@@ -210,6 +212,83 @@ def test_a_result_that_another_process_did_not_ask_for_is_not_due(make_executor,
         len(nodes.ran['stop']), n - len(nodes.ran['stop']))
     assert sinks['/brake:map']['completed'] == n
     assert executors[1].statistics()['dags']['main']['ends']['completed'] == n
+
+
+STAMPED = SOMETIMES.replace('dag: main', 'dag: main, release_from: header_stamp')
+ANNOUNCED_TOO = STAMPED + """
+  - node: /clock
+    callbacks:
+      - {name: tock, timer: 20ms, may_publish: [/tock], dag: other}
+  - node: /hand
+    callbacks:
+      - {name: strike, subscription: /tock, deadline: 60s}
+processes: {p1: [/camera, /detector, /clock], p2: [/brake, /hand]}
+"""
+
+
+@pytest.mark.parametrize('processes', [None, ('p1', 'p2')], ids=['machines', 'processes too'])
+def test_a_result_that_another_machine_did_not_ask_for_is_not_due(
+        make_executor, make_node, processes):
+    """Jobs that are identified by the stamps of messages end without a message as well."""
+    text = ANNOUNCED_TOO if processes else STAMPED
+    nodes = Declared(make_node, text, {'detect': lambda: frozenset(
+        [] if len(nodes.ran['detect']) % 3 == 0 else ['/alarm']), 'tock': lambda: frozenset(
+            ['/tock'])}, reentrant=False)
+    here = [[n for n in names.split() if n in nodes.nodes]
+            for names in ('camera detector clock', 'brake hand')]
+    executors = [make_executor(loads(text), nodes=[nodes.nodes[n] for n in names], **(
+        {'process': processes[i]} if processes else {})) for i, names in enumerate(here)]
+    with Spinning(executors[0]), Spinning(executors[1]):
+        assert wait_for(lambda: nodes.connected() and not any(e.unmatched() for e in executors))
+        matched(*(silences._publisher for e in executors for silences in e._ending.announcements
+                  if isinstance(silences, Silences)), count=2)
+        nodes.start(*executors)
+        assert wait_for(lambda: len(nodes.ran['stop']) >= 5)
+        nodes.cancel()
+        n = len(nodes.ran['detect'])
+        assert wait_for(lambda: sum(
+            executors[1].statistics()['dags']['main']['ends'].values()) == n)
+    assert executors[1].statistics()['dags']['main']['jobs'] == n
+    sinks = executors[1].statistics()['dags']['main']['sinks']
+    assert (sinks['/brake:stop']['completed'], sinks['/brake:stop']['not_due']) == (
+        len(nodes.ran['stop']), n - len(nodes.ran['stop']))
+    assert sinks['/brake:map']['completed'] == n
+    assert executors[1].statistics()['dags']['main']['ends']['completed'] == n
+
+
+def test_a_result_is_due_if_another_machine_says_nothing(make_executor, make_node):
+    """The machine with the detector may be dead: the results that it owes are missed."""
+    text = STAMPED.replace('stop, subscription: /alarm, deadline: 60s',
+                           'stop, subscription: /alarm, deadline: 20ms')
+    nodes = Declared(make_node, text)
+    executor = make_executor(loads(text), nodes=[nodes.nodes['brake']])
+    boxes = make_node('elsewhere').create_publisher(Header, '/boxes', 10)
+    with Spinning(executor):
+        matched(boxes)
+        stamp = time.time_ns()
+        boxes.publish(stamped(stamp))
+        assert wait_for(lambda: nodes.ran['map'] and time.time_ns() > stamp + 30 * MS)
+    executor.shutdown()  # it judges what is open
+    sinks = executor.statistics()['dags']['main']['sinks']
+    assert sinks['/brake:map']['completed'] == 1
+    assert (sinks['/brake:stop']['completed'], sinks['/brake:stop']['overdue']) == (0, 1)
+    assert 'not_due' not in sinks['/brake:stop']
+
+
+def test_forged_silences_are_ignored(make_executor, make_node):
+    nodes = Declared(make_node, STAMPED)
+    executor = make_executor(loads(STAMPED), nodes=[nodes.nodes['brake']])
+    silences, = executor._ending.announcements
+    executor.unmatched()  # it notices which callbacks are here
+    now = time.time_ns()
+    for stamp, dag, vertex, topic in (
+            (now - 10**15, 0, 1, 0), (now + 10**15, 0, 1, 0), (now, 1, 1, 0), (now, -1, 1, 0),
+            (now, 0, 99, 0), (now, 0, -1, 0), (now, 0, 1, 1), (now, 0, 0, 0)):
+        silences._hear(UInt8MultiArray(data=_SILENCE.pack(stamp, dag, vertex, topic)))
+    silences._hear(UInt8MultiArray(data=b'x' * 3))
+    assert executor.statistics()['dags']['main']['jobs'] == 0
+    silences._hear(UInt8MultiArray(data=_SILENCE.pack(now, 0, 1, 0)))
+    assert executor.statistics()['dags']['main']['jobs'] == 1
 
 
 def test_messages_without_announcement_wait_for_a_while_and_are_counted(make_executor, make_node):
