@@ -31,7 +31,7 @@ from mddag_executor.executor.asyncio_loop import (
     name_of,
     stepping,
 )
-from mddag_executor.executor.compat import awaited, NEXT_TURN
+from mddag_executor.executor.compat import awaited, NEXT_TURN, QuickCallback
 
 
 class Loops:
@@ -152,8 +152,9 @@ class Steps:
 
     def _step(self) -> Any:
         """Run a step in the context of its event loop; return what the coroutine awaits then."""
-        if self._waited is not None:
-            self._forget_waited(*self._waited)
+        waited, self._waited = self._waited, None
+        if waited is not None:
+            self._forget(*waited)
         outer, before = stepping.steps, asyncio._get_running_loop()
         if outer is not None:
             outer.let_others()  # a spin within a step
@@ -193,23 +194,26 @@ class Steps:
                 self._must_cancel = False
         return yielded
 
-    def suspended(
-        self, resume: Callable[[], object], waits_for: Any = None, callback: Any = None
-    ) -> None:
+    def suspended(self, resume: Callable[[], object], waits_for: Any = None) -> None:
         """
-        Note that its execution is suspended.
+        Note that its execution is suspended, before anything may resume it.
 
         :param resume: makes it ready again.
-        :param waits_for: the future that it waits for, which has ``callback`` for its end.
+        :param waits_for: the future that resumes it when it is done.
         """
         self.resume = resume
-        self._waited = None if waits_for is None else (waits_for, callback)
+        self._waited = None
+        if waits_for is not None:
+            waited = self._waited = waits_for, QuickCallback(resume)
+            waits_for.add_done_callback(waited[1])
+            if self._waited is not waited:  # another thread has resumed it meanwhile
+                self._forget(*waited)
         if self._must_cancel:
             resume()
 
-    def _forget_waited(self, waits_for: Any, callback: Any) -> None:
+    @staticmethod
+    def _forget(waits_for: Any, callback: Any) -> None:
         """Leave no callback in a future that it no longer waits for, as it was cancelled."""
-        self._waited = None
         if not (waits_for.done() or waits_for.cancelled()):
             waits_for.remove_done_callback(callback)
 

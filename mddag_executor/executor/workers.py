@@ -52,7 +52,7 @@ from mddag_executor.executor.bounds import (
     MOST_YIELD_NS,
     SHORT_CALLBACK_NS,
 )
-from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN, QuickCallback
+from mddag_executor.executor.compat import adopt_awaited, NEXT_TURN
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.engine import Engine, Step
@@ -720,21 +720,18 @@ class WorkerPool:
     def _resume_after(self, work: Work, awaited: Any) -> None:
         """Resume a suspended execution when the future that it waits for is done."""
         resume = partial(self.resume, work)
-        if awaited is NEXT_TURN or not hasattr(awaited, 'add_done_callback'):
-            if self.is_stepping:
-                self._of_next_step.append(work)
-                return
-            work.yields += 1
-            rest = min(work.yields * 1_000, MOST_YIELD_NS)
-            self.call_at(monotonic_ns() + rest, resume)
-        else:
+        if awaited is not NEXT_TURN and hasattr(awaited, 'add_done_callback'):
             work.yields = 0
             adopt_awaited(awaited, self.executor)
-            callback = QuickCallback(resume)
-            awaited.add_done_callback(callback)
-            work.coroutine.suspended(resume, awaited, callback)
+            work.coroutine.suspended(resume, awaited)
             return
         work.coroutine.suspended(resume)
+        if self.is_stepping:
+            self._of_next_step.append(work)
+            return
+        work.yields += 1
+        rest = min(work.yields * 1_000, MOST_YIELD_NS)
+        self.call_at(monotonic_ns() + rest, resume)
 
     # --- spin_once -------------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ from typing import Any
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import DONE, empty
 from mddag_executor.executor.attribution import Origin
-from mddag_executor.executor.compat import NEXT_TURN, QuickCallback
+from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.work import Destroyed, Refused, Work
 from mddag_executor.hosting.loading import describe
@@ -355,11 +355,12 @@ class Loop:
         def resume() -> None:
             self.engine.resume(work, self.now)
 
-        if waits_for is NEXT_TURN or not hasattr(waits_for, 'add_done_callback'):
-            self.at(self.now + POLL_NS, ARRIVED, resume)
-        else:
-            waits_for.add_done_callback(QuickCallback(partial(self.call_in_run, resume)))
-        work.coroutine.suspended(partial(self.call_in_run, resume))
+        in_run = partial(self.call_in_run, resume)
+        if waits_for is not NEXT_TURN and hasattr(waits_for, 'add_done_callback'):
+            work.coroutine.suspended(in_run, waits_for)
+            return
+        work.coroutine.suspended(in_run)
+        self.at(self.now + POLL_NS, ARRIVED, resume)
 
     def send(self, leave: Leave, record: Callable[[int], None] = lambda thread: None) -> None:
         """

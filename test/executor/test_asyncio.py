@@ -430,17 +430,19 @@ def test_a_future_that_stays_keeps_no_callbacks_of_waits_that_are_over(make_exec
     stays, done, kept = Future(), Future(), []
 
     async def wait():
+        is_over = asyncio.Event()
         for _ in range(5):
             with pytest.raises(asyncio.TimeoutError):
-                await asyncio.wait_for(asyncio.shield(wrapped()), 0.001)
+                await asyncio.wait_for(asyncio.shield(wrapped(is_over)), 0.001)
             with pytest.raises(asyncio.CancelledError):
                 asyncio.get_running_loop().call_later(0.001, asyncio.current_task().cancel)
                 await stays
         kept.append(len(stays._callbacks))
+        is_over.set()
         done.set_result(None)
 
-    async def wrapped():
-        await asyncio.sleep(0.003)
+    async def wrapped(is_over):
+        await is_over.wait()
 
     executor = make_executor()
     executor.create_task(wait)

@@ -3,6 +3,7 @@
 """Real runs are replayed, and their misses have the cause that they were given."""
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 import random
 import threading
 import time
@@ -36,17 +37,24 @@ GRAPH = graph(
         name: show, subscription: /odometry, deadline: 6ms""")
 
 
+def is_every(jobs):
+    job = current_job()  # None: its message came after its job had expired
+    return job is not None and job.job % jobs == 0
+
+
 def every(jobs, seconds):
     """Return a body that sleeps in each so many-th job."""
-    return lambda: time.sleep(0.0 if current_job().job % jobs else seconds)
+    return lambda: time.sleep(seconds if is_every(jobs) else 0.0)
 
 
-async def rectify():
+async def rectify(waiting):
     """Wait for something once in a while, without a worker."""
-    if current_job().job % 5 == 0:
+    if is_every(5):
         future = Future()
+        waiting.append(future)
         threading.Timer(0.004, future.set_result, (None,)).start()
         await future
+        waiting.remove(future)
 
 
 def test_entities_may_come_and_go_while_recorded(make_executor, make_node, tmp_path):
@@ -105,10 +113,11 @@ def test_an_undeclared_coroutine_is_one_execution_however_often_it_is_resumed(
 
 def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_path):
     """And misses are reported once each; callbacks end just before and after their deadlines."""
-    path, misses = tmp_path / 'live.mcap', []
+    path, misses, waiting = tmp_path / 'live.mcap', [], []
     nodes = Declared(make_node, GRAPH, {
-        'detect': lambda: time.sleep(0.002), 'rectify': rectify, 'join': every(7, 0.015),
-        'use': every(9, 0.007), 'show': lambda: time.sleep(random.uniform(0.0, 0.008))})
+        'detect': lambda: time.sleep(0.002), 'rectify': partial(rectify, waiting),
+        'join': every(7, 0.015), 'use': every(9, 0.007),
+        'show': lambda: time.sleep(random.uniform(0.0, 0.008))})
     undeclared = nodes.nodes['filter'].create_timer(0.03, lambda: time.sleep(0.001))
     executor = make_executor(
         loads(GRAPH, 'live.yaml'), num_workers=3, trace=str(path), on_deadline_miss=misses.append)
@@ -117,7 +126,7 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
         time.sleep(2.5)
         nodes.cancel()
         undeclared.cancel()
-        assert wait_for(lambda: is_idle(executor))
+        assert wait_for(lambda: not waiting and is_idle(executor))
     live = executor.statistics()
     outcome = replay(path)
     assert outcome.warnings == []
@@ -138,7 +147,10 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
     assert 10 < result['undeclared']['executions'] <= live['undeclared']
     assert sum(result['dropped'].values()) >= sum(live['dropped'].values())
     reported = sorted((miss.vertex, miss.job) for miss in misses)
-    assert len({*reported}) == len(reported) == total(live['dags']).missed > 20
+    missed = total(live['dags']).missed
+    assert len({*reported}) == len(reported)
+    # some reported as overdue may have ended in time: their threads could not say so before
+    assert 20 < missed <= len(reported) <= missed + sum(miss.kind == 'overdue' for miss in misses)
     dags = open_recording(path).task_set.dags
     assert reported == sorted(
         (dags[event['dag']].vertices[event['vertex']].name, event['job'])
