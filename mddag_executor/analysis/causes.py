@@ -20,7 +20,8 @@ along its critical chain (see ``chains``):
 * running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
-* end of a callback until the next one is ready: *transport*;
+* end of a callback until the next one is ready: *transport*; *other topic* if the next one is a
+  driven sync that completed with a message of another topic than the driving one;
 * ready callback in a recording of another executor, which does not say when a message or timer was
   noticed: *waited* while its own thread ran a callback; with an idle thread *released late* (a
   source), else *transport*, because the message was still on its way;
@@ -54,9 +55,11 @@ from mddag_executor.recording.joins import as_of, distinct
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
-          'demoted', 'less important', 'dropped', 'destroyed', 'not published', 'lost', 'failed')
+          'demoted', 'less important', 'dropped', 'destroyed', 'not published', 'lost', 'failed',
+          'other topic')
 (WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, DEMOTED, LESS_IMPORTANT,
- DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, RAN_USUALLY, UNKNOWN, SKIPPED) = range(17)
+ DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, OTHER_TOPIC, RAN_USUALLY, UNKNOWN, SKIPPED
+ ) = range(18)
 #: Kinds of time of a job; the last three are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown', 'skipped')
 #: By cause what to do about it.
@@ -79,7 +82,9 @@ REMEDIES = {
     'not published': 'publish in each execution of the callback before it',
     'lost': 'reliable QoS or a longer queue (QoS depth); if a process ended early (see the '
             'warnings), its end',
-    'failed': 'mend what the callback raises'}
+    'failed': 'mend what the callback raises',
+    'other topic': 'let the other topics of the sync come earlier: less work before them, or '
+                   'deadlines for the callbacks that publish them'}
 _DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED}
 """By reason of a drop its cause; jobs are aborted because of an earlier miss: they *waited*."""
 NO_MESSAGE = (DROPPED, DESTROYED, NOT_PUBLISHED, LOST)
@@ -108,7 +113,7 @@ callback ran (see ``Pool``).
 _SPAN = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('kind', 'i8'), ('begin', 'i8'), ('end', 'i8'),
     ('more', 'i8'), ('place', 'i8')])
-_LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _PENDING = range(6)
+_LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _OTHER_TOPIC, _PENDING = range(7)
 
 
 class Pool(NamedTuple):
@@ -124,6 +129,8 @@ class Pool(NamedTuple):
         recording of another executor, else its process; ``place_of_vertex``: the same of the last
         execution of each vertex, -1: none.
     :ivar threads: by thread when callbacks ran in it; None: places are processes.
+    :ivar answers: by execution whether a message of another topic than the driving one started it,
+        of a driven sync.
     """
 
     full: Spans
@@ -134,6 +141,7 @@ class Pool(NamedTuple):
     place_of: Ints
     place_of_vertex: Ints
     threads: dict[int, Spans] | None
+    answers: Mask
 
 
 class Usual(NamedTuple):
@@ -235,7 +243,8 @@ def find(
     left = spans['end'] - spans['begin'] - stood
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
     times[:, MACHINE] = stood
-    for kind, part in ((_LAG, RELEASED_LATE), (_TRANSPORT, TRANSPORT), (_BEFORE, UNKNOWN)):
+    for kind, part in ((_LAG, RELEASED_LATE), (_TRANSPORT, TRANSPORT), (_OTHER_TOPIC, OTHER_TOPIC),
+                       (_BEFORE, UNKNOWN)):
         times[kinds == kind, part] = left[kinds == kind]
     lags = kinds == _LAG
     if pool.knows_workers:
@@ -289,7 +298,8 @@ def _spans(rows: Table, chain: Table, is_source: Any, pool: Pool) -> Table:
     done = np.maximum(start, np.minimum(end, after))
     at = chain['vertex']
     after_vertex = np.where(is_last, rows['at'][of], np.r_[0, at[:-1]])
-    onward = np.where(is_last, _PENDING, _TRANSPORT)
+    waited_for = np.r_[False, pool.answers[chain['row'][:-1]]]  # when the next one was ready
+    onward = np.where(is_last, _PENDING, np.where(waited_for, _OTHER_TOPIC, _TRANSPORT))
     some = lengths > 0
     begins = (first + lengths - 1)[some]
     whole = is_source[at[begins]]

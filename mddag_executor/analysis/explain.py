@@ -155,7 +155,18 @@ class Explanation:
             Spans(*(crowded(since, until, 1) if len(holding) else crowded(start, end, 1))),
             Spans(*crowded(since, until, 2)),
             [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
-            self._place, of_vertex, threads)
+            self._place, of_vertex, threads, self._answers())
+
+    def _answers(self) -> Mask:
+        """Return which executions of driven syncs messages of other topics started."""
+        driven = {v: each.callback.driven_by for v, each in enumerate(self._task_set.vertices)
+                  if each.callback.driven_by is not None}
+        found = np.zeros(len(self._executions), dtype=np.bool_)
+        mine = np.flatnonzero(np.isin(self._executions['vertex'], [*driven]))
+        topic = self._recording.names.topic
+        found[mine] = [topic(callback) not in ('', driven[vertex]) for vertex, callback in zip(
+            *(self._executions[name][mine].tolist() for name in ('vertex', 'callback')))]
+        return found
 
     def _usual(self) -> Usual:
         """Return the usual times of callbacks and releases."""

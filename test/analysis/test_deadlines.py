@@ -292,3 +292,18 @@ def test_an_imported_sync_of_two_rates(tmp_path, has_stamps):
     response = result['dags']['/lidar']['sinks']['/brake:stop']['response_ns']
     assert (response['min'] // MS, response['max'] // MS) == (112 if has_stamps else 42, 142)
     assert result.get('guessed', {}) == ({} if has_stamps else {'/fusion:fuse': 1})
+
+
+def test_a_sync_that_waited_for_another_topic_says_so(tmp_path):
+    """Its driving message was there: no message was on its way for so long."""
+    told = Told(tmp_path / 'a.mcap', TWO_RATES.replace('150ms', '30ms'))
+    told.ran('/lidar:read', 0, 2, sends=[(1, '/points', 5)])
+    told.ran('/fusion:fuse', 3, 4, 1, '/points')
+    told.ran('/boxes:find', 130, 132, sends=[(131, '/boxes', 130)])
+    told.ran('/fusion:fuse', 133, 140, 131, '/boxes', [(139, '/fused', 5)])
+    told.ran('/brake:stop', 141, 142, 139, '/fused')
+    result = Replay(open_recording(told.write(), told.task_set)).explanation.result()
+    assert {cause: n for cause, n in result['causes'].items() if n} == {'other topic': 1}
+    job, = result['jobs']
+    assert [(p['vertex'], p['ns'] // MS) for p in job['parts'] if p['cause'] == 'other topic'] == [
+        ('/fusion:fuse', 129)]
