@@ -253,10 +253,11 @@ def _executions(engine):
             yield f'execution {x} has state {state.x_state[x]}, its work is of {work.x}'
         elif (x in work.entity.waiting) != (state.x_started[x] < 0):
             yield f'execution {x}, started at {state.x_started[x]}, is counted wrongly'
-    if (engine._is_bypassed or engine._bypass_queue or engine._bypassing) and not (
-            engine._is_bypassed and engine._is_core_empty()):
+    bypass = engine._bypass
+    if (bypass.is_open or bypass.queue or bypass.running) and not (
+            bypass.is_open and engine._is_core_empty()):
         yield 'executions bypass the core, which has others'
-    known = {**engine._work, **{work.x: work for work in engine._bypass_queue}}
+    known = {**engine._work, **{work.x: work for work in bypass.queue}}
     for entity in {work.entity for work in known.values()}:
         if any(x not in known or known[x].entity is not entity for x in entity.waiting):
             yield f'{[*entity.waiting]} are not all executions of one entity that wait'

@@ -116,7 +116,7 @@ class Announcements:
         self._allowance = Allowance(
             pool.unlocked_calls, self.subscriptions[0].topic_name if self._n_others else '')
         self._attribution.announce = self._announce
-        self._engine.on_silent.append(self._announce_silent)
+        self._engine.optional_topics.on_silent.append(self._announce_silent)
 
     def unmatched(self) -> list[str]:
         """Return the topics on which the processes have not discovered each other."""
@@ -132,7 +132,7 @@ class Announcements:
         """Stop announcing."""
         if self._publisher is not None:
             self._attribution.announce = None
-            self._engine.on_silent.remove(self._announce_silent)
+            self._engine.optional_topics.on_silent.remove(self._announce_silent)
             self._publisher = None
             self.node.destroy_node()
 

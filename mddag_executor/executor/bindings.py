@@ -79,7 +79,7 @@ class Bindings:
         self._found.add(callback.key)
         entity.declare(callback)
         link(entity, self._task_set, engine.tables)
-        entity.awaiting = engine.awaiting.get(callback.key)
+        entity.awaiting = engine.answers.awaiting.get(callback.key)
         entity.publishes = self._published[callback.key]
         if entity.is_due_at_release and entity.source >= 0:
             scheduler = engine.scheduler

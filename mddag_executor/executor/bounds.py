@@ -20,10 +20,14 @@ PATIENCE_NS = 4_000_000
 The longest that a ready callback waits because another one was expected to end.
 
 It is less if the ready one is urgent: its relative deadline by ``PATIENCE_PART``, but not less
-than twice the duration of a short callback.
+than ``LEAST_PATIENCE_NS``.  A callback that holds the interpreter is checked then, and once more
+after half of that time.  So what has a relative deadline of 20 ms starts 0.75 ms after it became
+ready, if the callback before it was expected to end, but waits.
 """
 
-PATIENCE_PART = 25
+PATIENCE_PART = 40
+
+LEAST_PATIENCE_NS = SHORT_CALLBACK_NS + 100_000
 
 NET_NS = 20_000_000
 """While a short callback runs longer than expected, arrivals stay unnoticed for this at most."""

@@ -19,38 +19,30 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     The queue keeps the place of a dropped message (``core.queues``), so a queue that overflows
     permanently gets its turn.
     Messages of the other topics of a driven sync belong to no job.  The execution that they start
-    may complete the vertex of one (``core.driven``): ``Work.answers``.
+    may complete the vertex of one (``answers``).
 3.  *The core decides* what to run, and handles the ends of executions (``finished``,
     ``suspended``, ``refused``, …): see ``core.rules``.  After all events of a turn are reported,
     ``step`` returns instructions: what to run, whether another thread may start something, and
     when to look again.  What else is read from outside is ``interpreter``.
 4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
-    undeclared callbacks run one after the other, in the order in which they became ready, and the
-    core does not know of them.  It would choose the same.  As soon as there is anything else to
-    choose from (a declared or long callback, a second thread), ``_core`` reports the running
-    one and the waiting ones to the core.
+    undeclared callbacks run past it, as it would choose the same (``bypass``).
 5.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped for newer ones) are
     counted, recorded and reported to the user (``verdicts``).
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
-from mddag_executor.core.driven import ANSWERED, Awaiting, GUESSED
+from mddag_executor.core.driven import ANSWERED, GUESSED
 from mddag_executor.core.estimates import note_time
-from mddag_executor.core.jobs import due_of_answer, is_judged, judge_from
+from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.overload import admit, is_late
-from mddag_executor.core.queues import (
-    first_of,
-    has_place,
-)
+from mddag_executor.core.queues import has_place
 from mddag_executor.core.state import (
-    ELSEWHERE,
     EXPIRED,
     IDLE,
     JUDGE_FROM,
@@ -60,22 +52,19 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
-from mddag_executor.executor.attribution import (
-    Announced,
-    Attribution,
-    header_stamp,
-    NO_ORIGIN,
-    Origin,
-)
+from mddag_executor.executor.answers import Answers, open_release
+from mddag_executor.executor.attribution import Announced, Attribution, NO_ORIGIN, Origin
 from mddag_executor.executor.bounds import NET_NS, SHORT_CALLBACK_NS
+from mddag_executor.executor.bypass import Bypass
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.interpreter import has_waiting, Interpreter
+from mddag_executor.executor.optional_topics import OptionalTopics
 from mddag_executor.executor.other_processes import OtherProcesses
+from mddag_executor.executor.outer_places import OuterPlaces
 from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.run_records import RunRecords
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
 from msg_graph import TaskSet
-from msg_graph.model import optional_edges
 
 if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
@@ -139,26 +128,12 @@ class Engine:
         #: Judges what is required of paths; None: nothing is.
         self.path_watch = PathWatch(task_set, process) if task_set is not None and any(
             path.requirements for path in task_set.paths) else None
-        # by vertex: the vertices that it may start, each with the topic that does
-        self._optional_edges: dict[int, list[tuple[int, str]]] = {}
-        for dag in task_set.dags if task_set else ():
-            first = self.tables.first_vertex[dag.index]
-            for vertex in dag.vertices:
-                if several := optional_edges(vertex, dag.vertices):
-                    self._optional_edges[first + vertex.index] = [
-                        (first + after, topic) for after, topic in several]
-        #: By the key of a callback that is a driven sync.
-        self.awaiting: dict[str, Awaiting[Origin]] = {}
-        self._driven: dict[str, list[int]] = {}     # its vertices
-        for number, each in enumerate(task_set.vertices if task_set else ()):
-            if each.callback.driven_by is not None:
-                self._driven.setdefault(each.callback.key, []).append(number)
-                self.awaiting.setdefault(each.callback.key, Awaiting(each.callback))
-        #: Each is called when a vertex ends without a topic that starts one in another process.
-        self.on_silent: list[Callable[[Origin, str], None]] = []
+        self.optional_topics = OptionalTopics(task_set, self.scheduler)
+        self.answers = Answers(task_set, self.tables, self.scheduler.state)
         admit(self.tables, self.scheduler.state)
         self.other_processes = OtherProcesses.of(
-            task_set, self.tables, self.scheduler, self.attribution, process)
+            task_set, self.tables, self.scheduler, self.attribution, process,
+            self.release_job)
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.n_workers = n_workers
         self.record = record
@@ -169,19 +144,15 @@ class Engine:
         # entities whose executions a callback group has refused
         self._to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
-        # see 4. above: the execution that runs meanwhile, since when, and those that wait, whose
-        # ids (``Work.x``) are below -1
-        self._is_bypassed = self._may_bypass = False
-        self._bypassing: Work | None = None
-        self._bypassing_since = 0
-        self._bypass_queue: deque[Work] = deque()
-        self._last_id = -1
+        self._bypass = Bypass()
+        self._may_bypass = False
         self._ready, self._held_back = self._state.ready, self._state.held_back
         self._scalars = self._state.scalars
         self._make_ready = self.scheduler.ready
         self._complete = self.scheduler.complete
         self._take = self.scheduler.take
         self._work: dict[int, Work] = {}
+        self.outer = OuterPlaces(self.scheduler, self._end_bypass, self._work)
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
         self._ended = NEVER
@@ -192,9 +163,9 @@ class Engine:
         self._keys_are_times = urgency != OTHER_KEYS
         # whether the ends of most executions only matter to the core
         self._is_plain = (
-            record is None and self.path_watch is None and not self._optional_edges)
+            record is None and self.path_watch is None and not self.optional_topics.edges)
         # whether the begin of an execution is to be noted
-        self._is_watched = bool(self.awaiting) or self.path_watch is not None
+        self._is_watched = bool(self.answers.awaiting) or self.path_watch is not None
         #: whether ``publishes`` is to be called
         self.notes_publications = record is not None or self.path_watch is not None
         self._default_deadline = default_deadline
@@ -279,10 +250,9 @@ class Engine:
                 self._drop_oldest(entity, now)
             return
         if isinstance(origin, Announced):
-            origin = self._entering(
-                origin.dag, origin.name, origin.vertex, min(release, now), now)
-        elif origin is None and stamp >= 0:
-            origin = self._enter(entity, stamp, min(release, now), now)
+            origin = self._enter(origin, min(release, now), now)
+        elif origin is None and stamp >= 0 and self.other_processes is not None:
+            origin = self.other_processes.enter_at(entity, stamp, min(release, now), now)
         if origin is None or not self._start_successor(work, origin, now):
             if entity.callback is not None:
                 entity.unattributed += 1
@@ -296,17 +266,13 @@ class Engine:
         self.undeclared += not entity.may_answer
         work.ready_ns = now
         waiting = entity.waiting
-        if entity.may_answer or 0 < entity.depth <= len(waiting):
+        bypass = self._bypass
+        if entity.may_answer or 0 < entity.depth <= len(waiting) or (
+                entity.outer >= 0 and not self.outer.is_open(entity.outer)):
             self._end_bypass()
-        elif not self._is_bypassed:
-            self._is_bypassed = self._may_bypass and self._is_core_empty()
-        if self._is_bypassed and entity.outer >= 0 and not self._is_outer_open(entity.outer):
-            self._end_bypass()
-        if self._is_bypassed:
-            x = work.x = self._last_id = self._last_id - 1
-            waiting[x] = None
-            self._bypass_queue.append(work)
-            entity.ready += 1
+        elif bypass.is_open or self._may_bypass and self._is_core_empty():
+            bypass.is_open = True
+            bypass.enter(work)
             return
         self._enqueue(work)
         entity.ready += 1
@@ -317,8 +283,9 @@ class Engine:
         entity, since = work.entity, work.ready_ns
         if entity.queue < 0:
             entity.queue = self.scheduler.new_queue()
-        if entity.may_answer and self._keys_are_times:
-            since = self._since_of_answer(entity, since)
+        if entity.may_answer and entity.callback is not None and self._keys_are_times:
+            # it is ordered by the job that it may answer
+            since = self.answers.due(entity.callback.key, since) - self._default_deadline
         if entity.callback is not None and entity.waiting and self._keys_are_times:
             # It belongs to no job, but comes after the messages that wait already.  Only the last
             # one, and the last one without a job, are compared: there may be many.
@@ -336,12 +303,6 @@ class Engine:
         entity.waiting[x] = None
         self._work[x] = work
 
-    def _since_of_answer(self, entity: Entity, now: int) -> int:
-        """Return since when an execution counts as ready to be ordered by the job it answers."""
-        assert entity.callback is not None
-        return min(due_of_answer(self.tables, self._state, vertex, now)
-                   for vertex in self._driven[entity.callback.key]) - self._default_deadline
-
     def allow_bypass(self) -> None:
         """Let undeclared executions bypass the core, if the policy runs them as they come."""
         policy, undeclared = self.scheduler.policy, self.tables.n_vertices
@@ -356,15 +317,12 @@ class Engine:
 
     def _end_bypass(self) -> Scheduler:
         """End the bypass: report everything to the core; return the core."""
-        if self._is_bypassed:
-            self._is_bypassed = False
-            work, self._bypassing = self._bypassing, None
-            if work is not None:
-                self._enqueue(work)
-                self._start_next(work.worker, self._bypassing_since)
-            bypassing, self._bypass_queue = self._bypass_queue, deque()
-            for work in bypassing:
-                del work.entity.waiting[work.x]
+        if self._bypass.is_open:
+            running, since, waiting = self._bypass.close()
+            if running is not None:
+                self._enqueue(running)
+                self._start_next(running.worker, since)
+            for work in waiting:
                 self._enqueue(work)
         return self.scheduler
 
@@ -376,51 +334,31 @@ class Engine:
 
     def _start_job(self, work: Work, release: int, now: int) -> None:
         dag = self.tables.dag_of[work.entity.source]
-        slot, state, source = self._release(dag, release, now), self._state, work.entity.source
+        slot, state, source = self.release_job(dag, release, now), self._state, work.entity.source
         work.origin = Origin(slot, dag, state.job_index[slot], source)
         self._start(work, state.job_base[slot] + self.tables.region_offset[source], now)
 
-    def _enter(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
-        """Find or start the job of a message from another process (see ``other_processes``)."""
-        if not entity.remote_publishers:
+    def _enter(self, job: Announced, release: int, now: int) -> Origin | None:
+        """Find or start an announced job."""
+        if self.other_processes is None or job.dag < 0:
             return None
-        first = entity.remote_publishers[0]
-        job = self._entering(self.tables.dag_of[first], stamp, first, release, now)
-        # For a sync: the first of its legs that has no message yet.
-        return None if job is None else job._replace(vertex=next((
-            v for v in entity.remote_publishers if self._state.x_state[
-                self.scheduler.execution(job.slot, *entity.targets[v])] == IDLE), first))
-
-    def _entering(
-        self, dag: int, name: int | tuple[int, int], vertex: int, release: int, now: int
-    ) -> Origin | None:
-        """Find or start the job of a stamp or an announced name."""
-        if self.other_processes is None or dag < 0:
-            return None
-        job = self.other_processes.find(dag, name)
-        if job is None:
-            slot = self._release(dag, release, now)
-            job = Origin(slot, dag, self._state.job_index[slot], vertex)
-            self.other_processes.note(name, job)
-        return job._replace(vertex=vertex)
+        return self.other_processes.enter(job.dag, job.name, job.vertex, release, now)
 
     def open_release(self, origin: Origin) -> int | None:
         """Return the release of an open job, None if the job has ended."""
-        state, slot = self._state, origin.slot
-        is_open = (state.job_dag[slot] == origin.dag and state.job_index[slot] == origin.job
-                   and state.job_state[slot] == OPEN)
-        return state.job_release[slot] if is_open else None
+        return open_release(self._state, origin)
 
     def _skip_job(self, entity: Entity, release: int, now: int) -> None:
         """Account for a release whose source does not run: the job expires at once."""
         dag = self.tables.dag_of[entity.source]
         if self._is_over(dag):
             return
-        slot = self._release(dag, release, now)
+        slot = self.release_job(dag, release, now)
         self.scheduler.give_up(slot, EXPIRED, now)
         self._decided(now)
 
-    def _release(self, dag: int, release: int, now: int) -> int:
+    def release_job(self, dag: int, release: int, now: int) -> int:
+        """Release the next job of a DAG; return its slot."""
         job = self._next_job[dag]
         self._next_job[dag] = job + 1
         slot = self.scheduler.release(dag, job, release, now)
@@ -453,7 +391,7 @@ class Engine:
         state.x_group[x] = entity.group
         state.x_outer[x] = entity.outer
         state.x_holds[x] = entity.habit.holds
-        if self._is_bypassed:
+        if self._bypass.is_open:
             self._end_bypass()
         self._make_ready(x, now)
         work.x = x
@@ -500,12 +438,12 @@ class Engine:
     @property
     def queue_length(self) -> int:
         """Return the number of executions that wait, for a worker or for their group."""
-        return len(self._bypass_queue) + self.scheduler.queue_length
+        return len(self._bypass.queue) + self.scheduler.queue_length
 
     @property
     def idle_workers(self) -> int:
         """Return the number of workers that run nothing."""
-        return self._state.scalars[N_IDLE] - (self._bypassing is not None)
+        return self._scalars[N_IDLE] - (self._bypass.running is not None)
 
     @property
     def is_busy(self) -> bool:
@@ -515,7 +453,7 @@ class Engine:
     @property
     def has_waiting(self) -> bool:
         """Return whether any execution waits, except for its callback group."""
-        return bool(self._bypass_queue) or has_waiting(self._state)
+        return bool(self._bypass.queue) or has_waiting(self._state)
 
     def step(self, worker: int, now: int, others_wait: bool = True) -> Step:
         """
@@ -526,9 +464,10 @@ class Engine:
         """
         step, ready, held_back = self._step, self._ready, self._held_back
         deadline = self.deadlines.next
-        if ready or held_back or self._bypass_queue:
+        bypass, holders = self._bypass, self._holders
+        if ready or held_back or bypass.queue:
             work = step.work = self._dispatch(worker, now)
-            waits = bool(ready or held_back or self._bypass_queue)
+            waits = bool(ready or held_back or bypass.queue)
         else:
             work = step.work = None
             waits = False
@@ -540,8 +479,12 @@ class Engine:
                 deadline = self.deadlines.first()
         step.is_short = is_short
         step.deadline = deadline
-        self._note_holders(step, work)
-        step.n_idle = self._scalars[N_IDLE] - (self._bypassing is not None)
+        step.holder = step.overtaken = None
+        if holders:
+            holder = step.holder = holders[-1]
+            if holder is work and len(holders) > 1 and self.interpreter.pauses:
+                step.overtaken = holders[-2]
+        step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
         if waits:
             self._advise(step, now, others_wait or not is_short)
         else:
@@ -552,10 +495,10 @@ class Engine:
     def look(self, now: int) -> Step:
         """Return what other threads are to do, after all events up to now."""
         step = self._step
-        step.work = None
+        step.work = step.overtaken = None
         step.is_short = step.more = False
         step.deadline = self.deadlines.next
-        self._note_holders(step, None)
+        step.holder = self._holders[-1] if self._holders else None
         step.n_idle = self.idle_workers
         step.patience_ns = NET_NS
         if self.has_waiting:
@@ -568,20 +511,11 @@ class Engine:
 
         NEVER: no worker is idle.
         """
-        if self._scalars[N_IDLE] <= (self._bypassing is not None):
+        if self.idle_workers < 1:
             return NEVER
         patience = self.interpreter.patience() if self.has_waiting else NET_NS
         # it is not known yet whether a holder really computes: half the time
         return patience // 2 if self._holders else patience
-
-    def _note_holders(self, step: Step, work: Work | None) -> None:
-        """Set what a step says about who holds the interpreter."""
-        holders = self._holders
-        step.holder = step.overtaken = None
-        if holders:
-            holder = step.holder = holders[-1]
-            if holder is work and len(holders) > 1 and self.interpreter.pauses:
-                step.overtaken = holders[-2]
 
     def _advise(self, step: Step, now: int, asks: bool) -> None:
         """
@@ -593,10 +527,13 @@ class Engine:
         step.more = asks and self._may_start_more(now)
 
     def _dispatch(self, worker: int, now: int) -> Work | None:
-        if self._is_bypassed:
-            work = self._dispatch_past_core(worker, now)
-            if work is not None or self._is_bypassed:
-                return work
+        if self._bypass.is_open:
+            past_core = self._bypass.start(worker, now)
+            if past_core is not None:
+                if past_core.entity.collect_more is not None:
+                    self._collect_more(past_core.entity)
+                return past_core
+            self._end_bypass()
         state = self._state
         if state.worker_x[worker] >= 0:
             if not self._scalars[N_IDLE]:
@@ -607,25 +544,6 @@ class Engine:
         work = self._start_next(worker, now)
         if work is not None and work.entity.collect_more is not None:
             self._collect_more(work.entity)
-        return work
-
-    def _dispatch_past_core(self, worker: int, now: int) -> Work | None:
-        """Start the first execution that bypasses the core, or end the bypass."""
-        queue = self._bypass_queue
-        if not queue:
-            return None
-        entity = queue[0].entity
-        if self._bypassing is not None or entity.wall_ns > SHORT_CALLBACK_NS or (
-                entity.gate is not None):
-            self._end_bypass()
-            return None
-        work = self._bypassing = queue.popleft()
-        self._bypassing_since = now
-        del entity.waiting[work.x]
-        work.x = -1
-        work.worker = worker
-        if entity.collect_more is not None:
-            self._collect_more(entity)
         return work
 
     @staticmethod
@@ -656,58 +574,16 @@ class Engine:
 
     def _begin_watched(self, work: Work, now: int) -> None:
         """Note the start of an execution that may answer, or belongs to a path."""
-        if work.entity.awaiting is not None and work.answers is None:
-            self._begin_driven(work, work.entity.awaiting)
+        self.answers.begin(work)
         if self.path_watch is not None:
             begun = work.origin or work.answers
             if begun is not None:
                 self.path_watch.begun(work, begun.vertex, now)
 
-    def _begin_driven(self, work: Work, awaiting: Awaiting[Origin]) -> None:
-        """Note the start of an execution of a driven sync: which job it may answer."""
-        awaiting.hear(work.entity.topic)
-        if work.origin is not None:
-            awaiting.receive(work.origin, header_stamp(work.args[0]) if work.args else -1)
-            work.answers = work.origin
-        else:
-            work.answers = awaiting.newest(self._is_open) or NO_ORIGIN
-
-    def note_published(self, work: Work, topic: str, message: Any) -> None:
-        """
-        Note what an execution of a driven sync publishes: which job it answers.
-
-        A thread that publishes calls this without the lock.
-        """
-        awaiting = work.entity.awaiting
-        if awaiting is None:
-            return
-        work.published |= {topic}
-        if work.origin is None:
-            work.answers = awaiting.named(
-                topic, header_stamp(message), work.answers) or NO_ORIGIN
-
     def origin_of(self, work: Work) -> Origin | None:
         """Return the job of what an execution publishes; None: it has none."""
         origin = work.origin or work.answers
         return None if origin is NO_ORIGIN else origin
-
-    def answered_job(self, work: Work) -> Origin | None:
-        """Return the open job that an execution of a driven sync answers so far, if any."""
-        awaiting, job = work.entity.awaiting, work.answers
-        if awaiting is None or job is None or job is NO_ORIGIN or not (
-                self._is_open(job) and awaiting.is_answer(work.published)):
-            return None
-        return job
-
-    def _is_open(self, origin: Origin) -> bool:
-        return self.open_release(origin) is not None
-
-    def _answered(self, work: Work) -> list[Origin]:
-        """Return the jobs whose driven sync an execution completes, the one it answers first."""
-        awaiting, job = work.entity.awaiting, self.answered_job(work)
-        if awaiting is None or job is None:
-            return []
-        return [each for each in awaiting.answer(job) if self._is_open(each)]
 
     def relative_deadline(self, entity: Entity) -> int:
         """Return the least time (ns) from an arrival at an entity to its deadline, or a guess."""
@@ -725,9 +601,9 @@ class Engine:
         return deadline // 2  # its job was released before it arrived
 
     def _may_start_more(self, now: int) -> bool:
-        if self._is_bypassed:
-            if self._bypassing is None or not self._bypass_queue:
-                return bool(self._bypass_queue)
+        if self._bypass.is_open:
+            if self._bypass.running is None or not self._bypass.queue:
+                return bool(self._bypass.queue)
             self._end_bypass()
         return self.interpreter.may_start_more(now)
 
@@ -795,48 +671,6 @@ class Engine:
             if x >= 0 and self._state.x_state[x] == SUSPENDED:
                 self.scheduler.ask_again(x)
 
-    # --- outer groups ----------------------------------------------------------------------------
-
-    def new_outer_group(self) -> int:
-        """Add an outer group of callbacks (see ``core.rules``, rule 4); it is closed."""
-        return self.scheduler.new_outer_group()
-
-    def free_outer_group(self, outer: int) -> None:
-        """Let the number of an outer group without callbacks be used again."""
-        self.scheduler.free_outer_group(outer)
-
-    def open_outer(self, outer: int, limit: int, once: bool = False) -> bool:
-        """
-        Set how many executions of an outer group may run at a time.
-
-        :param once: it closes when the next one starts.
-        :return: whether one may start now.
-        """
-        core, state = self._end_bypass(), self._state
-        core.open_outer(outer, limit, once)
-        return any(
-            state.x_outer[first_of(state, entry)] == outer and has_place(
-                state, first_of(state, entry))
-            for queue in (state.ready, state.held_back) for entry in queue)
-
-    def take_outer_wait(self, outer: int) -> int:
-        """Return how long (ns) executions have waited for others of it since the last call."""
-        waited = self._state.outer_wait[outer]
-        self._state.outer_wait[outer] = 0
-        return waited
-
-    def _is_outer_open(self, outer: int) -> bool:
-        state = self._state
-        return state.outer_limit[outer] > 0 and not state.outer_once[outer]
-
-    def move(self, entity: Entity, outer: int) -> None:
-        """Move an entity to another outer group, or to none (-1)."""
-        core = self._end_bypass()
-        entity.outer = outer
-        for work in self._work.values():
-            if work.entity is entity:
-                core.set_outer(work.x, outer)
-
     # --- ends of executions ----------------------------------------------------------------------
 
     def finished(
@@ -852,8 +686,8 @@ class Engine:
         entity = work.entity
         entity.ran += 1
         entity.busy_ns += end - start
-        if work is self._bypassing:
-            self._bypassing = None
+        if work is self._bypass.running:
+            self._bypass.running = None
             entity.failed += failed
             if self._records is not None:
                 self._records.run(work, start, end, vtid, worker)
@@ -888,12 +722,16 @@ class Engine:
         if entity.awaiting is not None:
             is_guess = origin is None and work.answers is not None and (
                 entity.awaiting.is_guess(work.answers))
-            completes = [] if failed else self._answered(work)
+            completes = [] if failed else self.answers.completed_by(work)
             origin = completes[0] if completes else origin
-        published: dict[Origin, set[str] | None] = {}
+        published: dict[Origin, set[str]] = {}
+        optional = self.optional_topics
         for each in completes:
-            if each.vertex in self._optional_edges:
-                published[each] = self._withhold(work, each, failed, end)
+            if each.vertex in optional.edges and optional.completes(each):
+                topics = self.attribution.published(each)
+                published[each] = topics if entity.awaiting is None else set(work.published)
+                if not failed:
+                    optional.withhold(each, published[each], end)
         whole = (self.scheduler.fail if failed else self._complete)(x, end)
         if entity.awaiting is not None:
             whole = bool(completes)
@@ -923,41 +761,14 @@ class Engine:
         if self.path_watch is not None:
             self.path_watch.left(work)
 
-    def _withhold(
-        self, work: Work, origin: Origin, failed: bool, now: int
-    ) -> set[str] | None:
-        """
-        Leave out of a job what an execution that ends might have started, but has not.
-
-        :return: its published topics of ``may_publish``; None: a leg that was not the last.
-        """
-        slot, _, _, vertex = origin
-        pending = self._state.x_pending[self.scheduler.execution(slot, vertex)]
-        if pending > 1:
-            return None     # a leg of a sync that was not the last
-        published = self.attribution.published(origin)
-        if work.entity.awaiting is not None:
-            published = set(work.published)
-        if not failed and pending >= 0:
-            for after, topic in self._optional_edges[vertex]:
-                if topic not in published:
-                    if self._state.expected[after] == ELSEWHERE:
-                        for announce in self.on_silent:
-                            announce(origin, topic)
-                    self.scheduler.withhold(slot, vertex, after, now)
-        return published
-
     def hear_silent(self, job: Announced, topic: str, now: int) -> None:
         """Leave out of a job what an execution in another process has not started."""
-        several = self._optional_edges.get(job.vertex, ()) if job.dag >= 0 else ()
-        if self._finished or self._state.expected[job.vertex] != ELSEWHERE or topic not in [
-                each for _, each in several]:
+        if self._finished or not self.optional_topics.is_heard(job.dag, job.vertex, topic):
             return
-        origin = self._entering(job.dag, job.name, job.vertex, min(job.release, now), now)
+        origin = self._enter(job, min(job.release, now), now)
+        if origin is not None and self.open_release(origin) is not None:
+            self.optional_topics.withhold_heard(origin, topic, now)
         if origin is not None:
-            for after, each in several:
-                if each == topic and self._is_open(origin):
-                    self.scheduler.withhold(origin.slot, job.vertex, after, now)
             self._decided(now)
 
     def suspended(self, work: Work, start: int, end: int, vtid: int, worker: int) -> None:

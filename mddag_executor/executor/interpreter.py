@@ -20,7 +20,12 @@ from mddag_executor.core.queues import (
     overtaking_pays_from,
 )
 from mddag_executor.core.state import N_IDLE, State
-from mddag_executor.executor.bounds import MOST, PATIENCE_NS, PATIENCE_PART, SHORT_CALLBACK_NS
+from mddag_executor.executor.bounds import (
+    LEAST_PATIENCE_NS,
+    MOST,
+    PATIENCE_NS,
+    PATIENCE_PART,
+)
 
 if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
@@ -41,7 +46,7 @@ class Interpreter:
         self.pauses = False
         # by vertex: see ``patience``
         self._patience = [
-            min(PATIENCE_NS, max(2 * SHORT_CALLBACK_NS, offset // PATIENCE_PART))
+            min(PATIENCE_NS, max(LEAST_PATIENCE_NS, offset // PATIENCE_PART))
             for offset in tables.rad_offset]
 
     @property

@@ -40,11 +40,12 @@ Two executors in one process that share a graph are treated as two processes.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 import threading
 from typing import Any
 
 from mddag_executor.core import Scheduler, Tables
+from mddag_executor.core.state import IDLE
 from mddag_executor.executor.attribution import Attribution, Origin
 from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.entity import Entity
@@ -58,13 +59,14 @@ class OtherProcesses:
 
     ``host`` and ``find`` need the engine's lock; ``note`` may be called from any thread.
 
+    :param start_job: starts a job of a DAG, given its release and the time; returns its slot.
     :param dags: those identified by stamps.
     :param announced: the indices of those whose publications are announced.
     """
 
     def __init__(
         self, task_set: TaskSet, tables: Tables, scheduler: Scheduler,
-        attribution: Attribution,
+        attribution: Attribution, start_job: Callable[[int, int, int], int],
         dags: Sequence[Dag], announced: Set[int] = frozenset(),
     ) -> None:
         self._announced = announced
@@ -73,6 +75,7 @@ class OtherProcesses:
         self._tables = tables
         self._scheduler = scheduler
         self._attribution = attribution
+        self._start_job = start_job
         self._callbacks = [v.callback.key for d in task_set.dags for v in d.vertices]
         self._here: dict[int, list[int]] = {}
         # the topics on which messages go to other processes
@@ -88,6 +91,7 @@ class OtherProcesses:
     def of(
         task_set: TaskSet | None, tables: Tables, scheduler: Scheduler,
         attribution: Attribution, process: str | None,
+        start_job: Callable[[int, int, int], int],
     ) -> OtherProcesses | None:
         """
         Return the object for a declaration; None: no DAG extends beyond the process.
@@ -100,7 +104,8 @@ class OtherProcesses:
         announced: set[int] = set() if process is None else divided(task_set)
         if not stamped and not announced:
             return None
-        return OtherProcesses(task_set, tables, scheduler, attribution, stamped, announced)
+        return OtherProcesses(
+            task_set, tables, scheduler, attribution, start_job, stamped, announced)
 
     @property
     def announces(self) -> bool:
@@ -187,6 +192,29 @@ class OtherProcesses:
                     self._names.pop((gone.dag, gone.job), None)
                     self._stamps.pop((gone.dag, gone.job), None)
         self._jobs[key] = origin
+
+    def enter(
+        self, dag: int, name: int | tuple[int, int], vertex: int, release: int, now: int
+    ) -> Origin:
+        """Find or start the job of a stamp or an announced name, for a vertex."""
+        job = self.find(dag, name)
+        if job is None:
+            slot = self._start_job(dag, release, now)
+            job = Origin(slot, dag, self._scheduler.state.job_index[slot], vertex)
+            self.note(name, job)
+        return job._replace(vertex=vertex)
+
+    def enter_at(self, entity: Entity, stamp: int, release: int, now: int) -> Origin | None:
+        """Find or start the job of a message from another process (rule 3)."""
+        if not entity.remote_publishers:
+            return None
+        first = entity.remote_publishers[0]
+        job = self.enter(self._tables.dag_of[first], stamp, first, release, now)
+        # For a sync: the first of its legs that has no message yet.
+        states, execution = self._scheduler.state.x_state, self._scheduler.execution
+        return job._replace(vertex=next((
+            v for v in entity.remote_publishers
+            if states[execution(job.slot, *entity.targets[v])] == IDLE), first))
 
     def find(self, dag: int, name: int | tuple[int, int]) -> Origin | None:
         """Return the job of a stamp or name, also one that has ended; None for a new one."""

@@ -41,8 +41,8 @@ class OuterGroup:
         self._create_task_in = create_task_in
         with pool.lock:
             while pool.freed_outer_groups:
-                pool.engine.free_outer_group(pool.freed_outer_groups.popleft())
-            self.number = pool.engine.new_outer_group()
+                pool.engine.outer.free(pool.freed_outer_groups.popleft())
+            self.number = pool.engine.outer.new()
         pool.outer_groups[self.number] = self
         # Any thread may call the finalizer, even one that owns the lock.
         weakref.finalize(self, pool.freed_outer_groups.append, self.number).atexit = False
@@ -68,7 +68,7 @@ class OuterGroup:
         limit, once = self._limit, self._once
         if self.n_nested:
             limit, once = max(1, limit), False
-        may_start = pool.engine.open_outer(self.number, limit, once)
+        may_start = pool.engine.outer.open(self.number, limit, once)
         if limit:
             pool.wake_for_more()
         return may_start
@@ -96,7 +96,7 @@ class OuterGroup:
     def take_wait_ns(self) -> int:
         """Return how long callbacks have waited for others of the group since the last call."""
         with self._pool.lock:
-            return self._pool.engine.take_outer_wait(self.number)
+            return self._pool.engine.outer.take_wait(self.number)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
         """Run a function or coroutine as one of the group."""

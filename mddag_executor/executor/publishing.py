@@ -170,7 +170,7 @@ def _send(
             state.is_tracked = True
             work = running.work
             if work is not None and work.entity.awaiting is not None:
-                running.engine.note_published(work, state.topic, msg)
+                running.engine.answers.note_published(work, state.topic, msg)
             origin = None if work is None else work.origin or work.answers
             publication: Publication = running.engine.attribution.publish(
                 original, publisher, msg, state, topic, origin or NO_ORIGIN)

@@ -155,7 +155,7 @@ class Registry:
                     else:
                         present[id(rclpy_object)] = entity
                         if entity.outer != outer:
-                            self._engine.move(entity, outer)
+                            self._engine.outer.move(entity, outer)
                             moved.append(entity)
         gone = [each for key, each in self.by_id.items() if key not in present]
         for each in gone:  # first: a new one may be their callback's next entity

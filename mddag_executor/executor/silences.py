@@ -84,12 +84,12 @@ class Silences:
         self.subscriptions = [self.node.create_subscription(
             UInt8MultiArray, name, self._hear, _QOS, callback_group=ReentrantCallbackGroup())]
         self._allowance = Allowance(pool.unlocked_calls, name)
-        self._engine.on_silent.append(self._announce)
+        self._engine.optional_topics.on_silent.append(self._announce)
 
     def close(self) -> None:
         """Stop announcing."""
         if self._publisher is not None:
-            self._engine.on_silent.remove(self._announce)
+            self._engine.optional_topics.on_silent.remove(self._announce)
             self._publisher = None
             self.node.destroy_node()
 

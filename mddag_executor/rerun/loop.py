@@ -272,7 +272,7 @@ class Loop:
             return
         self.callbacks += 1
         if is_driven:   # one that does not answer only stores its message
-            origin = self.engine.answered_job(work)
+            origin = self.engine.answers.job_of(work)
             release = self.engine.open_release(origin) or 0 if origin is not None else 0
             if origin is not None and work.coroutine is None:
                 takes = self._times.execution(origin.vertex, release)

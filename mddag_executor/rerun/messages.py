@@ -215,7 +215,7 @@ class Messages:
         if current is not None:
             work, topic = current.work, outlet.state.topic
             work.entity.publishes.add(topic)
-            self._engine.note_published(work, topic, msg)
+            self._engine.answers.note_published(work, topic, msg)
             self._engine.attribution.note_optional(
                 topic, self._engine.origin_of(work) or NO_ORIGIN)
         self._loop.send(partial(self._leave, outlet, data),

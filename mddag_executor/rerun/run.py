@@ -151,7 +151,8 @@ class Rerun:
             max_active_jobs=MAX_ACTIVE_JOBS, expire_after=EXPIRE_AFTER_NS,
             record=None if writer is None else writer.record)
         engine.other_processes = OtherProcesses(
-            task_set, engine.tables, engine.scheduler, engine.attribution, task_set.dags)
+            task_set, engine.tables, engine.scheduler, engine.attribution, engine.release_job,
+            task_set.dags)
         # the callbacks that hold the interpreter, declared or else recorded
         self._holders = {
             vertex.callback.key for place, vertex in enumerate(task_set.vertices)

@@ -160,7 +160,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'executor/lending.py', 'self._go_on_without(work)', 'pass')], of(
         'test_gil.py', 'test_workers_that_wait_for_a_callback_do_not_keep_it_waiting')),
     Case('what_bypasses_the_core_stays_unknown', [(
-        'executor/engine.py', 'self._start_next(work.worker, self._bypassing_since)', 'pass')],
+        'executor/engine.py', 'self._start_next(running.worker, since)', 'pass')],
         of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
     Case('core_bypassed_while_it_has_others', [(
         'executor/engine.py', 'self._may_bypass and self._is_core_empty()', 'self._may_bypass')],
