@@ -16,6 +16,7 @@ from mddag_executor.analysis.paths import Paths
 from mddag_executor.analysis.requirements import Requirements
 from mddag_executor.analysis.usage import group_waits, share, Usage
 from mddag_executor.core import NEVER
+from mddag_executor.memory import give_back
 from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.recording import Recording
@@ -134,7 +135,9 @@ class Replay:
     def result(self) -> ReplayResult:
         """Return the result format of ``replay --json``."""
         recording, head, duration = self.recording, self.recording.run.head, self.duration_ns
+        give_back()
         paths = self.paths.results()    # first, because they need the most memory
+        give_back()
         guesses: ReplayResultRare = {}
         if guessed := recording.guessed:
             guesses['guessed'] = guessed

@@ -134,10 +134,11 @@ class Judged:
             jobs, verdicts = self._judge(dag, completions.pop(0), ends[dag])
             self.jobs.append(jobs)
             found += verdicts
-        give_back()     # memory of the completions
         table = concatenate([rows(VERDICTS), *found])
         found.clear()
         self.verdicts = table[sort_by(table['order'])]
+        del table
+        give_back()     # memory of the completions
         self.tally = self._tally()
 
     @cached_property

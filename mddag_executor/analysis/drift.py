@@ -49,12 +49,11 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
                 skipped = np.rint(np.diff(np.sort(mine)) / periods[key]) - 1
                 of.count += int(skipped[skipped > 0].sum())
     # declared callbacks that were started, and other executions, a coroutine's once each
-    vertex, start, end = (table[name].copy() for name in ('vertex', 'start', 'end'))
+    vertex, start, end = (table[name] for name in ('vertex', 'start', 'end'))
     declared = (vertex >= 0) & (start >= 0)
     every = (declared | (vertex < 0) & (end >= 0)) & (table['piece'] == 0)
     waits = (end < 0) & (start >= recording.end)
     late = (end >= since) | (end < 0)
-    del vertex, start, end
     numbers, callback_of = recording.callbacks()
     counts, late_counts, late_got = (dict(zip(numbers.tolist(), np.bincount(
         callback_of[which], minlength=len(numbers)).tolist()))

@@ -56,7 +56,7 @@ from collections.abc import Mapping
 from typing import Any, cast, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.analysis.spread import spread
-from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
+from mddag_executor.recording.columns import concatenate, in_parts, Ints, Mask, rows, Table
 from mddag_executor.recording.joins import (
     as_of,
     different,
@@ -174,7 +174,9 @@ class Paths:
         if recording.names.vertices:
             self._add_vertices(recording.names.vertices)
         # by the index of a callback the rows of its executions
-        place = np.where(self._vertex >= 0, self._place[self._vertex], NONE)
+        place = np.empty(len(table), dtype=np.int32)
+        for part, vertex in zip(in_parts(place), in_parts(self._vertex)):
+            part[:] = self._place[vertex]
         self._of_place = [
             each.astype(np.int32) for each in rows_by(place, len(self._places))]
         self._later = later_pieces(table)

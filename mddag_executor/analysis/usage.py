@@ -16,13 +16,13 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, cast, TYPE_CHECKING
 
 from mddag_executor.analysis.spans import Spans
 from mddag_executor.recording.columns import in_parts, Ints, Table
 from mddag_executor.recording.columns import rows as table_of
-from mddag_executor.recording.joins import different, later_pieces, rows_by, sort_by
+from mddag_executor.recording.joins import different, distinct, later_pieces, rows_by, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import NOTHING, UNKNOWN
 import numpy as np
@@ -49,15 +49,19 @@ def ran(table: Table) -> Ints:
     return rows
 
 
+def _has_groups(recording: Recording) -> bool:
+    return max(recording.names.groups.values(), default=UNKNOWN) >= 0
+
+
 def in_groups(recording: Recording) -> Iterator[tuple[int, Ints, Ints, Ints]]:
     """
     Yield mutually exclusive groups, and rows, starts and ends of their executions that started.
 
     They are in the order of ends; open ones come last, and end with the recording.
     """
-    table, known = recording.executions, recording.names.groups
-    if max(known.values(), default=UNKNOWN) < 0:
+    if not _has_groups(recording):
         return
+    table, known = recording.executions, recording.names.groups
     rows = np.r_[ran(table), np.flatnonzero((table['start'] >= 0) & (table['end'] < 0))]
     callbacks, which = recording.callbacks()
     group = np.array([known.get(each, UNKNOWN) for each in callbacks.tolist()], np.int64)[
@@ -79,6 +83,8 @@ def group_waits(recording: Recording) -> Ints:
     waits; all of its rows have the value.
     """
     table = recording.executions
+    if not _has_groups(recording):
+        return np.broadcast_to(np.int64(0), len(table))     # which takes no memory
     waited = np.zeros(len(table), dtype=np.int64)
     for _, rows, starts, ends in in_groups(recording):
         ready = table['ready'][rows]
@@ -100,16 +106,18 @@ def worker_spans(
     :param which: the executions that count.
     """
     table = recording.executions[['worker', 'start', 'end']]
-    rows = np.flatnonzero(
-        (table['worker'] >= 0) & (table['start'] >= 0) & (table['end'] > begin)
-        & (table['start'] < end) & which)
-    workers, number = different(table['worker'][rows])
+    counts = (table['worker'] >= 0) & (table['start'] >= 0) & (table['end'] > begin) & (
+        table['start'] < end) & which
     found = {}
-    for worker, mine in zip(workers.tolist(), rows_by(number, len(workers))):
-        mine = rows[mine]
+    for worker in distinct(table['worker']).tolist():
+        # of one after the other, which takes less memory than sorting all rows by worker
+        mine = np.flatnonzero(counts & (table['worker'] == worker))
+        if not len(mine):
+            continue
         starts, ends = np.maximum(table['start'][mine], begin), np.minimum(table['end'][mine], end)
-        order = sort_by(starts)
-        starts, ends = starts[order], ends[order]
+        if (starts[1:] < starts[:-1]).any():
+            order = sort_by(starts)
+            starts, ends = starts[order], ends[order]
         starts[1:] = np.maximum(starts[1:], np.maximum.accumulate(ends)[:-1])
         found[worker] = starts[starts < ends], ends[starts < ends]
     return found
@@ -121,6 +129,7 @@ class PoolUse:
 
     Steps begin at multiples of their length.  With more than ``MOST_STEPS`` the length is doubled.
 
+    :param spans: starts and ends of the times in which a worker was busy, several arrays of each.
     :param step: initial length, ns.
     :param begin: when the recording begins, ns: if no worker was busy, the only step is there.
     """
@@ -129,25 +138,26 @@ class PoolUse:
     MOST_STEPS = 600
 
     def __init__(
-        self, starts: Ints, ends: Ints, step: int = FIRST_STEP_NS, begin: int | None = None
+        self, spans: Collection[tuple[Ints, Ints]], step: int = FIRST_STEP_NS,
+        begin: int | None = None,
     ) -> None:
         self.step = step
         self.start: int | None = None
         self.busy: list[int] = []
-        spans = list(_spans(starts, ends))
-        if not spans:
+        bounds = [(int(start.min()), int(end.max())) for start, end in _parts(spans)]
+        if not bounds:
             if begin is not None:
                 self.start, self.busy = begin // step * step, [0]
             return
-        first = min(int(start.min()) for start, _ in spans)
-        last = max(int(end.max()) for _, end in spans) - 1
+        first = min(start for start, _ in bounds)
+        last = max(end for _, end in bounds) - 1
         while last // self.step - first // self.step >= self.MOST_STEPS:
             self.step *= 2
         number = first // self.step
         self.start = number * self.step
         steps = (number + np.arange(last // self.step - number + 2)) * self.step
         busy = np.zeros(len(steps) - 1, dtype=np.int64)
-        for each in spans:
+        for each in _parts(spans):
             busy += Spans(*each).within(steps[:-1], steps[1:])
         self.busy = busy.tolist()
 
@@ -156,12 +166,13 @@ class PoolUse:
         return {'step_ns': self.step, 'start_ns': self.start, 'busy_ns': self.busy}
 
 
-def _spans(starts: Ints, ends: Ints) -> Iterator[tuple[Ints, Ints]]:
+def _parts(spans: Collection[tuple[Ints, Ints]]) -> Iterator[tuple[Ints, Ints]]:
     """Yield parts of the spans that are known and not empty."""
-    for start, end in zip(in_parts(starts), in_parts(ends)):
-        some = (start >= 0) & (start < end)
-        if some.any():
-            yield start[some], end[some]
+    for starts, ends in spans:
+        for start, end in zip(in_parts(starts), in_parts(ends)):
+            some = (start >= 0) & (start < end)
+            if some.any():
+                yield start[some], end[some]
 
 
 class Usage:
@@ -186,13 +197,15 @@ class Usage:
             self._ran(part[_TIMES][ran], wait[ran])
             self._completed(part[_TOTALS][ran & (part['completes'] != NOTHING) & (
                 part['vertex'] >= 0)])
-        #: How long workers ran declared callbacks, ns.
-        self.busy = sum(_busy(worker_spans(
-            recording, begin, end, table['vertex'] >= 0)).values())
         spans = worker_spans(recording, begin, end)
         #: By worker how long it ran callbacks, ns.
         self.by_worker = _busy(spans)
-        self.pool = PoolUse(*in_one(spans), begin=begin)
+        self.pool = PoolUse(spans.values(), begin=begin)
+        del spans
+        declared = table['vertex'] >= 0
+        #: How long workers ran declared callbacks, ns.
+        self.busy = sum((self.by_worker if declared.all() else _busy(
+            worker_spans(recording, begin, end, declared))).values())
         lent = np.flatnonzero((table['worker'] < 0) & (table['start'] >= 0))
         self._lent = int(np.maximum(0, np.minimum(table['end'][lent], end) - np.maximum(
             table['start'][lent], begin)).sum())
@@ -252,13 +265,6 @@ class Usage:
             'lent_ns': self._lent,
             'use': share(sum(self.by_worker.values()), count, self._duration),
             'over_time': self.pool.result()}
-
-
-def in_one(spans: Mapping[int, tuple[Ints, Ints]]) -> tuple[Ints, Ints]:
-    """Return the starts and ends of all workers together."""
-    starts, ends = (np.concatenate([np.empty(0, dtype=np.int64), *each])
-                    for each in (zip(*spans.values()) if spans else ((), ())))
-    return starts, ends
 
 
 def _busy(spans: Mapping[int, tuple[Ints, Ints]]) -> dict[int, int]:

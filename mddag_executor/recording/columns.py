@@ -120,6 +120,10 @@ class Table:
             found[name] = column
         return found
 
+    def replace(self, name: str, column: npt.NDArray[Any]) -> None:
+        """Replace a column by an equal one that takes less memory."""
+        self._columns[name] = column
+
     def freeze(self) -> None:
         """Let no column be written any more."""
         for column in self._columns.values():
@@ -177,9 +181,8 @@ class Growing:
         before, self._count = self._count, self._count + n
         if self._count > self._capacity:
             self._grow(max(1024, 2 * self._count))
-        for name, column in self._columns.items():
-            column[before:self._count] = columns[name] if name in columns else \
-                self._values.get(name, 0)
+        for name, values in {**self._values, **columns}.items():
+            self._columns[name][before:self._count] = values
         return self.rows()[before:]
 
     def rows(self) -> Table:
@@ -195,9 +198,10 @@ class Growing:
         return self.rows()
 
     def _grow(self, capacity: int) -> None:
-        """Make room, which takes no memory before it is used."""
+        """Make room, which takes no memory before something is written to it."""
         for name, column in self._columns.items():
-            larger = np.empty(capacity, dtype=column.dtype)
-            larger[:len(column)] = column
+            larger = np.zeros(capacity, dtype=column.dtype)
+            if column.any():
+                larger[:len(column)] = column
             self._columns[name] = larger
         self._capacity = capacity

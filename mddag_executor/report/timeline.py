@@ -12,7 +12,7 @@ rest is spread over the run.
 from __future__ import annotations
 
 from mddag_executor.analysis.deadlines import Judged
-from mddag_executor.analysis.usage import in_one, PoolUse, ran, worker_spans
+from mddag_executor.analysis.usage import PoolUse, ran, worker_spans
 from mddag_executor.recording.columns import Ints
 from mddag_executor.recording.recording import Recording
 import numpy as np
@@ -43,9 +43,9 @@ class Timeline:
         table = recording.executions
         rows = ran(table)
         self.busy_over_time = PoolUse(
-            *in_one(worker_spans(recording, recording.run.begin, recording.end)), _FIRST_STEP)
+            worker_spans(recording, recording.run.begin, recording.end).values(), _FIRST_STEP)
         missed = np.maximum(judged.missed['completed'], judged.missed['deadline'])
-        self.missed_over_time = PoolUse(missed, missed + 1, _FIRST_STEP)
+        self.missed_over_time = PoolUse([(missed, missed + 1)], _FIRST_STEP)
         self.n_executions, self.n_missed = len(rows), len(missed)
 
         end, verdicts = table['end'][rows], judged.verdicts

@@ -265,7 +265,8 @@ class ExecutionJoin:
         # no leg: see ``core.driven``
         guessed = (leg[which] == GUESSED) & (self._numbering.n_legs[table['vertex'][row]] == 1)
         table['leg'][row] = np.where(guessed, ANSWERED, leg[which])
-        table['guessed'][row], table['cpu'][row] = guessed, complete['cpu_time'][event]
+        table['guessed'][row[guessed]] = True
+        table['cpu'][row] = complete['cpu_time'][event]
         table['holds_gil'][row] = complete['held_interpreter'][event]
         table['completes'][row] = np.where(complete['last_leg'][event], VERTEX, LEG)
         self._completed.add(rows(

@@ -76,7 +76,7 @@ def test_a_schedule_without_overhead_has_none(jobs):
 def test_no_time_is_lost_and_steps_are_few(spans):
     starts = np.array([start for start, _ in spans], dtype=np.int64)
     took = np.array([each for _, each in spans], dtype=np.int64)
-    result = PoolUse(starts, starts + took).result()
+    result = PoolUse([(starts, starts + took)]).result()
     assert sum(result['busy_ns']) == int(took.sum())
     assert len(result['busy_ns']) <= PoolUse.MOST_STEPS
     busy = [(start, start + took) for start, took in spans if took]
