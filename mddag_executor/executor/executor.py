@@ -46,6 +46,7 @@ from mddag_executor.executor.diagnostics import Diagnostics
 from mddag_executor.executor.ending import Ending
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.gil import short_switch_interval
+from mddag_executor.executor.interrupts import InterruptsDeferred, wait_readable
 from mddag_executor.executor.loop import raise_limit
 from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.outer_groups import outer_here, OuterGroup
@@ -463,6 +464,10 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _spin(self, done: Callable[[], bool], timeout_sec: float | None) -> None:
         deadline = deadline_of(timeout_sec)
+        with InterruptsDeferred():
+            self._spin_deferred(done, deadline)
+
+    def _spin_deferred(self, done: Callable[[], bool], deadline: float | None) -> None:
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
@@ -517,7 +522,8 @@ class MultiDeadlineExecutor(BareExecutor):
             left = self._patience_s(deadline, rest)
             if left is not None and left <= 0 and rest is None:
                 return
-            self._at_once.handle(self._at_once.loop.wait(-1 if left is None else left))
+            wait_readable(self._at_once.loop.fd, left)
+            self._at_once.handle(self._at_once.loop.wait(0))
         self._raise_error()
 
     def _start_threads(self) -> None:
@@ -644,6 +650,10 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _spin_once(self, timeout_sec: float | None, done: Callable[[], bool]) -> None:
         deadline = deadline_of(timeout_sec)
+        with InterruptsDeferred():
+            self._spin_once_deferred(deadline, done)
+
+    def _spin_once_deferred(self, deadline: float | None, done: Callable[[], bool]) -> None:
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
@@ -676,7 +686,8 @@ class MultiDeadlineExecutor(BareExecutor):
             return True
         if done():  # the event that woke it has just been handled
             return False
-        self._wait_stepping(self._patience_s(deadline, self._upkeep.rest_s()))
+        wait_readable(self._stepping_epoll().fileno(), self._patience_s(
+            deadline, self._upkeep.rest_s()))
         return self._handle_once()
 
     def _stepping_epoll(self) -> select.epoll:
@@ -696,15 +707,6 @@ class MultiDeadlineExecutor(BareExecutor):
         self._submit_tasks()
         return self._pool.run_one(self._pool.loop.wait(0)) or ran
 
-    def _wait_stepping(self, left: float | None) -> None:
-        """Wait for an arrival or a due time; at most ``left`` seconds, None: for ever."""
-        stepping = self._stepping_epoll()
-        fd = stepping.fileno()
-        if left is None or fd >= 1024:  # which ``select`` does not support
-            stepping.poll(-1 if left is None else left)
-        else:
-            select.select([fd], [], [], left)  # resolution 1 us; that of an epoll is 1 ms
-
     async def spin_async(self) -> None:
         """
         Run callbacks in the running event loop, one at a time, until shutdown.
@@ -723,10 +725,11 @@ class MultiDeadlineExecutor(BareExecutor):
         try:
             with self._pool.stepping(), self._signals.watch():
                 while not self.is_ending() and not self._was_ended():
-                    self._raise_error()
-                    self._start_threads()
-                    ran = self._handle_once()
-                    self._raise_error()
+                    with InterruptsDeferred():
+                        self._raise_error()
+                        self._start_threads()
+                        ran = self._handle_once()
+                        self._raise_error()
                     if ran:
                         await asyncio.sleep(0)  # other coroutines of the loop
                     elif not (self.is_ending() or is_over(self.context)):

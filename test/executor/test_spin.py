@@ -362,6 +362,119 @@ def test_no_interrupt_gets_lost_where_something_of_a_context_dies(ros_context, m
     assert interrupts > 200 and lost == []
 
 
+class Injector:
+    """Sends SIGINT to this thread at the n-th line that it runs in the package."""
+
+    def __init__(self):
+        self.left = 0
+
+    def _of_frame(self, frame, event, arg):
+        return self._at_line if '/mddag_executor/' in frame.f_code.co_filename else None
+
+    def _at_line(self, frame, event, arg):
+        if event == 'line':
+            self.left -= 1
+            if self.left == 0:
+                sys.settrace(None)
+                signal.raise_signal(signal.SIGINT)
+        return self._at_line
+
+    def interrupts(self, function, n):
+        """Call a function; return whether KeyboardInterrupt came out of it."""
+        before, self.left = sys.gettrace(), n
+        try:
+            sys.settrace(self._of_frame)
+            function()
+        except KeyboardInterrupt:
+            return True
+        finally:
+            sys.settrace(before)
+        return False
+
+
+@pytest.mark.parametrize('steps', [True, False])
+def test_an_interrupt_at_any_line_of_a_spin_loses_nothing(make_executor, make_node, steps):
+    """A program that catches KeyboardInterrupt and spins again goes on as if none had come."""
+    node, fired, received = make_node(), [], []
+    node.create_timer(0.001, lambda: fired.append(1))
+    node.create_subscription(Header, '/topic', lambda msg: received.append(msg.frame_id), 10)
+    node.create_service(Trigger, '/ask', lambda request, response: response)
+    publisher, client = node.create_publisher(Header, '/topic', 10), node.create_client(
+        Trigger, '/ask')
+    executor, injector, interrupts = make_executor(num_workers=2, nodes=[node]), Injector(), 0
+
+    def turn():
+        if steps:
+            executor.spin_once(0.01)
+        else:
+            executor.spin_until_future_complete(Future(), 0.01)
+
+    def until(done):
+        end = time.monotonic() + 15
+        while not done() and time.monotonic() < end:
+            turn()
+        return done()
+
+    assert client.wait_for_service(15) and until(lambda: len(fired) > 5)
+    for n in range(1, 700, 17):
+        publisher.publish(Header(frame_id=str(n)))
+        answer, task = client.call_async(Trigger.Request()), executor.create_task(bool)
+        interrupts += injector.interrupts(lambda: [turn(), turn(), turn()], n)
+        before = len(fired)
+        assert until(lambda: str(n) in received and answer.done() and task.done()), n  # noqa: B023
+        assert until(lambda: len(fired) > before), n  # noqa: B023
+    assert interrupts > 20
+
+
+@pytest.mark.parametrize('kind', ['sleep', 'call', 'coroutine', 'publish'])
+def test_a_callback_is_interrupted_at_once(make_executor, make_node, kind):
+    """Also one that computes in a call of the package: by the second SIGINT at the latest."""
+    node, begun, interrupts = make_node(), threading.Event(), []
+    publisher = node.create_publisher(Header, '/topic', 10)
+    client = node.create_client(Trigger, '/nobody')
+
+    def sleep():
+        begun.set()
+        time.sleep(30)
+
+    def call():
+        begun.set()
+        client.call(Trigger.Request())
+
+    async def coroutine():
+        sleep()
+
+    def publish():
+        begun.set()
+        while True:
+            publisher.publish(Header())
+
+    def raise_once(number, frame):
+        interrupts.append(number)
+        if len(interrupts) == 1:
+            raise KeyboardInterrupt
+
+    def interrupt():
+        begun.wait(15)
+        while not is_over.wait(0.1):
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    executor, is_over = make_executor(nodes=[node]), threading.Event()
+    executor.create_task({'sleep': sleep, 'call': call, 'coroutine': coroutine,
+                          'publish': publish}[kind])
+    thread = threading.Thread(target=interrupt)
+    before = signal.signal(signal.SIGINT, raise_once)
+    try:
+        thread.start()
+        with pytest.raises(KeyboardInterrupt):
+            while True:
+                executor.spin_once()
+    finally:
+        is_over.set()
+        thread.join()
+        assert signal.signal(signal.SIGINT, before) == raise_once
+
+
 PROGRAM = """
 import os, threading, time
 import rclpy
