@@ -87,6 +87,16 @@ def test_services_and_actions():
     assert int(undeclared) >= 13
 
 
+def test_asyncio_service():
+    *answers, beats = run('asyncio_service').splitlines()
+    assert answers == [
+        'rest: slept for 0.2 s', 'read: in a thread of asyncio: True',
+        'ask: the other service slept for 0.2 s', 'requests that slept at once: 3']
+    # The timer went on while callbacks slept for 0.6 s.
+    count, in_time = map(int, re.fullmatch(r'beats: (\d+), in time: (\d+)', beats).groups())
+    assert in_time <= count and count >= 10
+
+
 def test_two_processes(tmp_path):
     found = result('two_processes', tmp_path)
     chain = found['dags']['chain']
