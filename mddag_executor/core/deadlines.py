@@ -12,6 +12,7 @@ next job, and is replaced when its time has come.
 from __future__ import annotations
 
 from heapq import heappop, heappush
+from itertools import pairwise
 
 from mddag_executor.core.jobs import judge_incomplete, next_deadline
 from mddag_executor.core.state import OPEN, SINK_OVERDUE, State
@@ -32,12 +33,18 @@ class Deadlines:
         # by slot: the time of its entry, and until when its job was judged
         self._entry: dict[int, int] = {}
         self._judged: dict[int, int] = {}
+        # by DAG: the least relative deadline of its sinks
+        self._least = [
+            min((t.sink_deadline[each] for each in t.sinks[first:last]), default=NEVER)
+            for first, last in pairwise(t.first_sink)]
         self.next = NEVER
 
     def watch(self, slot: int) -> None:
         """Watch the job that was just released in a slot."""
+        state = self._state
         self._judged[slot] = -NEVER
-        self._add(slot, -NEVER)
+        # it is too early, and replaced then, if that sink is in another process
+        self._add(slot, state.job_release[slot] + self._least[state.job_dag[slot]])
 
     def judge(self, now: int) -> None:
         """Decide ``SINK_OVERDUE`` for each sink whose deadline was before now."""
@@ -51,7 +58,7 @@ class Deadlines:
                 judge_incomplete(
                     *self._rule, slot, SINK_OVERDUE, self._judged[slot], now - 1)
                 self._judged[slot] = now - 1
-                self._add(slot, now - 1)
+                self._add(slot, next_deadline(*self._rule, slot, now - 1))
         self.next = heap[0][0] if heap else NEVER
 
     def first(self) -> int:
@@ -64,8 +71,7 @@ class Deadlines:
             self.next = heap[0][0] if heap else NEVER
         return self.next
 
-    def _add(self, slot: int, after: int) -> None:
-        time = next_deadline(*self._rule, slot, after)
+    def _add(self, slot: int, time: int) -> None:
         if time < self._entry.get(slot, NEVER):
             self._entry[slot] = time
             heappush(self._heap, (time, slot))

@@ -46,7 +46,8 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     :param job: index of the job in its DAG, from 0.
     :param release: time its source became due, ns; not later than ``now``.
     """
-    expire_idle(t, s, dag, now)
+    if t.expire_after[dag] < NEVER:
+        expire_idle(t, s, dag, now)
     if s.n_open[dag] >= t.max_active_jobs[dag]:
         give_up(t, s, s.oldest[dag], EXPIRED, now)
     slot = s.free_slot[dag]
@@ -62,13 +63,19 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     s.job_late[slot] = 0
     s.job_demoted[slot] = -1
     s.job_active[slot] = 0
-    _link_newest(s, dag, slot)
+    newest = s.newest[dag]
+    s.job_previous[slot] = newest
+    s.job_next[slot] = -1
+    if newest < 0:
+        s.oldest[dag] = slot
+    else:
+        s.job_next[newest] = slot
+    s.newest[dag] = slot
+    s.n_open[dag] += 1
     base = s.job_base[slot]
     for x in range(base, base + t.n_region[dag]):
         s.x_state[x] = IDLE
         s.x_pending[x] = t.n_predecessors[s.x_vertex[x]]
-        s.x_worker[x] = -1
-        s.x_follows[x] = 0
     if s.partial[dag] != 0:
         _leave_out(t, s, slot)
     return slot
@@ -120,18 +127,6 @@ def _leave_out(t: Tables, s: State, slot: int) -> None:
             s.job_sinks_left[slot] += 1
 
 
-def _link_newest(s: State, dag: int, slot: int) -> None:
-    newest = s.newest[dag]
-    s.job_previous[slot] = newest
-    s.job_next[slot] = -1
-    if newest < 0:
-        s.oldest[dag] = slot
-    else:
-        s.job_next[newest] = slot
-    s.newest[dag] = slot
-    s.n_open[dag] += 1
-
-
 def judge_from(s: State, release: int) -> None:
     """Judge only jobs released from a time on (rule 6); NEVER: none for now."""
     s.scalars[JUDGE_FROM] = release + s.scalars[SKIP]
@@ -151,14 +146,17 @@ def judge(
     t: Tables, s: State, slot: int, kind: int, vertex: int, deadline: int, time: int
 ) -> None:
     """Decide the result of a job at a sink, if both are judged (rule 6)."""
-    if t.judged[vertex] != 0 and is_judged(s, slot):
+    if t.judged[vertex] != 0 and (  # not is_judged(): one call less
+            s.scalars[JUDGE_FROM] <= s.job_release[slot] < s.scalars[JUDGE_UNTIL]):
         s.decisions.append(
             (kind, s.job_dag[slot], vertex, s.job_index[slot], deadline, time))
 
 
 def close_job(s: State, slot: int, end: int, now: int) -> None:
     """End an open job (rule 8): remove it from the list; free its slot if nothing is active."""
-    judged = -1 if is_judged(s, slot) else NOT_JUDGED
+    judged = NOT_JUDGED
+    if s.scalars[JUDGE_FROM] <= s.job_release[slot] < s.scalars[JUDGE_UNTIL]:
+        judged = -1
     dag = s.job_dag[slot]
     s.decisions.append((JOB_END, dag, judged, s.job_index[slot], end, now))
     before, after = s.job_previous[slot], s.job_next[slot]
@@ -270,7 +268,7 @@ def withhold_from(t: Tables, s: State, slot: int, by: int, vertex: int, now: int
     while older >= 0 and t.driven[by] >= AFTER_DRIVEN:
         before = s.job_previous[older]
         x = s.job_base[older] + t.region_offset[by]
-        if s.x_follows[x] != 0 and s.x_pending[x] >= 0:
+        if s.x_follows[x] == s.job_index[older] and s.x_pending[x] >= 0:
             withhold(t, s, older, vertex, now)
         older = before
 

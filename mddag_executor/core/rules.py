@@ -141,6 +141,7 @@ from mddag_executor.core.queues import (
     come_forward,
     defer,
     enqueue,
+    first_of,
     has_place,
     leave_outer,
     may_start,
@@ -188,11 +189,11 @@ def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
     s.job_active[slot] += 1
     order = s.scalars[ORDER] = s.scalars[ORDER] + 1
     vertex = s.x_vertex[x]
-    s.x_key[x] = key(
-        t, vertex, s.job_release[slot], s.job_index[slot], order) + (s.x_queue[x],)
+    queue = s.x_queue[x]
+    s.x_key[x] = key(t, vertex, s.job_release[slot], s.job_index[slot], order) + (queue,)
     enqueue(t, s, x)
     keep = t.keep[vertex]
-    if keep != KEEP_ALL and s.queue_first[s.x_queue[x]] != s.queue_last[s.x_queue[x]]:
+    if keep != KEEP_ALL and s.queue_first[queue] != s.queue_last[queue]:
         if keep == KEEP_NEWEST:
             _keep_newest(t, s, x, now)
         else:
@@ -311,7 +312,8 @@ def peek(t: Tables, s: State, now: int) -> int:
         heap = next_heap(s)
     while heap:
         entry = heap[0]
-        x = s.queue_first[entry[4]] if entry[4] >= 0 else ~entry[4]
+        queue = entry[4]
+        x = s.queue_first[queue] if queue >= 0 else ~queue
         group = s.x_group[x]
         if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
             heappop(heap)
@@ -375,13 +377,10 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     x = peek(t, s, now)
     if x < 0:
         return -1
-    queue = s.x_queue[x] if s.x_state[x] == WAITING else ~x
-    if s.ready and s.ready[0][4] == queue:
-        s.x_key[x] = heappop(s.ready)
-    else:
-        s.x_key[x] = heappop(s.held_back)
+    entry = _pop_first(s, x) if s.held_back else heappop(s.ready)
+    s.x_key[x] = entry
+    queue = entry[4]
     if queue >= 0:
-        s.queue_place[queue] = READY
         after = s.queue_first[queue] = s.x_next[x]
         if after < 0:
             s.queue_last[queue] = s.queue_demoted[queue] = -1
@@ -401,6 +400,16 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     if s.outer_limit and s.x_outer[x] >= 0:
         _enter_outer(s, x, s.x_outer[x], now)
     return x
+
+
+def _pop_first(s: State, x: int) -> QueueEntry:
+    """Remove and return the entry of an execution, first of those that are ready or deferred."""
+    if s.ready and first_of(s, s.ready[0]) == x:
+        return heappop(s.ready)
+    entry = heappop(s.held_back)
+    if entry[4] >= 0:
+        s.queue_place[entry[4]] = READY
+    return entry
 
 
 def lend(s: State, x: int) -> None:
@@ -493,8 +502,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     """
     worker = s.x_worker[x]
     if worker >= 0:  # not lend(): a call less for each execution
-        s.worker_x[worker] = -1
-        s.x_worker[x] = -1
+        s.worker_x[worker] = s.x_worker[x] = -1
         s.scalars[N_IDLE] += 1
         if s.x_holds[x] != 0:
             s.scalars[N_HOLDING] -= 1
@@ -512,19 +520,20 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         return True
     slot = s.x_slot[x]
     head = s.job_base[slot] + t.region_offset[vertex]
+    driven = t.driven[vertex]
     whole = True
     if s.scalars[PROPAGATE] == 0:
-        if t.driven[vertex] & DRIVEN != 0:
+        if driven & DRIVEN != 0:
             whole = False  # the driver says which execution answers
         elif t.n_predecessors[vertex] > 0:
-            s.x_pending[head] -= 1
-            whole = s.x_pending[head] == 0
+            pending = s.x_pending[head] = s.x_pending[head] - 1
+            whole = pending == 0
     if whole:
         s.x_pending[head] = -1
         if s.job_state[slot] == OPEN:
             _complete_vertex(t, s, key, slot, vertex, now)
-    s.job_active[slot] -= 1  # not deactivate(): one call less
-    if s.job_active[slot] == 0 and s.job_state[slot] != OPEN:
+    active = s.job_active[slot] = s.job_active[slot] - 1  # not deactivate(): one call less
+    if active == 0 and s.job_state[slot] != OPEN:
         free_slot(s, slot)
     return whole
 
@@ -558,9 +567,10 @@ def follow(
         for i in range(t.first_successor[v], t.first_successor[v + 1]):
             successor = t.successors[i]
             x, there = base + t.region_offset[successor], other + t.region_offset[successor]
-            if s.x_follows[x] != 0 or s.x_pending[x] < 0 or s.job_state[slot] != OPEN:
+            if s.x_follows[x] == s.job_index[slot] or s.x_pending[x] < 0 or (
+                    s.job_state[slot] != OPEN):
                 continue
-            s.x_follows[x] = 1
+            s.x_follows[x] = s.job_index[slot]
             after.append(successor)
             if s.x_pending[there] < 0 and s.x_state[there] == IDLE:
                 withhold(t, s, slot, successor, now)
@@ -588,34 +598,37 @@ def _complete_vertex(
     t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
 ) -> None:
     """Complete a vertex in an open job, and in those that follow it there (rule 14)."""
-    before = s.job_previous[slot]
-    _complete_in(t, s, slot, vertex, now)
-    if t.driven[vertex] >= AFTER_DRIVEN and s.scalars[PROPAGATE] == 0:
-        older = before
+    propagate = s.scalars[PROPAGATE]
+    older = -1
+    if t.driven[vertex] >= AFTER_DRIVEN and propagate == 0:
+        older = s.job_previous[slot]
+    ends = t.sink_deadline[vertex] >= 0 or s.expected[vertex] == LEADS_OUT
+    if ends:
+        _end_in(t, s, slot, vertex, now)
+    if propagate == 0:
         while older >= 0:
             before = s.job_previous[older]
             x = s.job_base[older] + t.region_offset[vertex]
-            if s.x_follows[x] != 0 and s.x_pending[x] >= 0:
+            if s.x_follows[x] == s.job_index[older] and s.x_pending[x] >= 0:
                 s.x_pending[x] = -1
-                _complete_in(t, s, older, vertex, now)
+                if ends:
+                    _end_in(t, s, older, vertex, now)
             older = before
-    if s.scalars[PROPAGATE] == 1:  # a sink, which may have ended the job, has no successors
+    elif propagate == 1:  # a sink, which may have ended the job, has no successors
         for i in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
             satisfy_edge(t, s, key, slot, t.successors[i], now)
 
 
-def _complete_in(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
-    """Complete a vertex in one job: judge it if it is a sink, and end the job after its last."""
-    is_sink = t.sink_deadline[vertex] >= 0
-    late = False
-    if is_sink:
-        deadline = s.job_release[slot] + t.sink_deadline[vertex]
-        late = now > deadline and t.judged[vertex] != 0
+def _end_in(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
+    """Complete a sink, or what leads out, in one job: judge it, and end the job after its last."""
+    relative = t.sink_deadline[vertex]
+    if relative >= 0 and t.judged[vertex] != 0:
+        deadline = s.job_release[slot] + relative
+        late = now > deadline
         judge(t, s, slot, SINK_LATE if late else SINK_IN_TIME, vertex, deadline, now)
         if late:
             s.job_late[slot] += 1
             note_late(t, s, vertex, now)
-    if is_sink or s.expected[vertex] == LEADS_OUT:
-        s.job_sinks_left[slot] -= 1
-        if s.job_sinks_left[slot] == 0:
-            close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)
+    left = s.job_sinks_left[slot] = s.job_sinks_left[slot] - 1
+    if left == 0:
+        close_job(s, slot, LATE if s.job_late[slot] > 0 else COMPLETED, now)

@@ -156,7 +156,7 @@ class State(NamedTuple):
     x_cost: list[int]
     # of a sink: the last demoted job
     x_demoted: list[int]
-    # 1: it completes when it does in a later job (rule 14)
+    # the last job in which its vertex completes when it does in a later job (rule 14)
     x_follows: list[int]
     # decisions that the driver has not fetched yet
     decisions: list[Decision]
@@ -270,7 +270,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_left.append(0)
             s.x_cost.append(0)
             s.x_demoted.append(-1)
-            s.x_follows.append(0)
+            s.x_follows.append(-1)
 
 
 def add_process(s: State, n_workers: int) -> None:
