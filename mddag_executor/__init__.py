@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     'DeadlineMiss', 'MultiDeadlineExecutor', 'Replay', 'ReplayError', 'Reschedule', 'Traces',
     'open_recording', 'replay', 'reschedule', '__version__']
-__version__ = '2.0.0'
+__version__ = '3.0.0'
 
 __getattr__, __dir__ = on_first_use(__name__, {
     'DeadlineMiss': 'mddag_executor.executor',

@@ -5,8 +5,9 @@ Patterns of English that readers had to read twice, and what to write instead.
 
 Theory of operation
 -------------------
-1. Checked are the pages (Markdown, without code), and of Python files the comments, docstrings and
-   messages.  A text is one paragraph of a page, one block of comments, or one string with a blank.
+1. The test reads the pages (Markdown, without code), and the comments, docstrings and messages
+   of Python files.  A text is one paragraph of a page, one block of comments, or one string with
+   a blank.
 2. A pattern is a regular expression over a text whose line breaks are blanks.  It should find no
    good sentence: a pattern that has to be argued with is worse than none.
 3. The changelog of released versions is history, and stays as it is.
@@ -73,6 +74,11 @@ PATTERNS = (
     Pattern("write 'even if', 'and also', or a sentence of its own",
             r'[,;(:] ?also (?:if|when|of|for|in|as|with|without|from|by|on|an|a|the)\b',
             'It ends, also if a callback runs.'),
+    Pattern("begin with the subject: 'the test checks …', not 'checked are …'",
+            r'(?:^|[.;:] |\* |\d\. )(?:Not )?(?:[Jj]udged|[Cc]hecked|[Rr]etained|[Uu]nknown|'
+            r'[Ll]eft out|[Ll]isted|[Cc]ounted|[Rr]ead|[Ss]hown|[Oo]rdered|[Kk]ept) '
+            r'(?:is|are|was|were) ',
+            'The run ends. Judged are the jobs of the range.'),
     Pattern("write 'later', 'longer' or 'how much longer'",
             r'\b[Hh]ow many times as\b|\bas late as\b|\bas \w+ as where\b',
             'How many times as long callbacks may take.'),

@@ -127,6 +127,16 @@ def test_names_and_versions_agree():
     assert (TOP / 'resource' / name).is_file()
 
 
+def test_the_changelog_has_each_line_once():
+    """A merge keeps the lines of both sides: so it can double an entry, or a whole section."""
+    text = (TOP / 'CHANGELOG.md').read_text(encoding='utf-8')
+    versions = re.findall(r'^## (\S+)', text, re.MULTILINE)
+    assert len(versions) == len(set(versions)) and len(versions) > 2
+    for part in re.split(r'^## ', text, flags=re.MULTILINE)[1:]:
+        lines = re.findall(r'^(?:### |- ).*', part, re.MULTILINE)
+        assert [line for line in lines if lines.count(line) > 1] == []
+
+
 def run_nodes(node):
     """Yield all nodes but those that only type checkers read."""
     yield node

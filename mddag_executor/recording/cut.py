@@ -5,7 +5,7 @@ Cuts a time range out of a recording.
 
 Theory of operation
 -------------------
-1. Judged are the jobs that were released in the range, begin included, end excluded.  They keep
+1. A part has the jobs that were released in the range, begin included, end excluded.  They keep
    all their rows, also later ones, so their verdicts and response times equal those in the whole
    recording.
 2. The part ends when the last of these jobs ended, but not before the end of the range.  Other

@@ -7,7 +7,7 @@ Source: the Common Trace Format 2.0 (https://diamon.org/ctf).
 
 1. The metadata is a sequence of JSON objects, the *fragments*, each after a byte 0x1E.  A fragment
    describes the trace, its clock, a stream, a kind of event, or names a type for later ones.
-2. Read are the types of the specification, except those that neither LTTng nor Babeltrace writes:
+2. The types of the specification are read, except those that neither LTTng nor Babeltrace writes:
    optional fields, integers of a variable length, and texts that are not UTF-8.  A trace that has
    one of them is refused, with its name.
 3. A member of the head of a packet or event has a *role*, which says what it means.  It gets the

@@ -61,7 +61,7 @@ def test_a_simulated_path_by_hand(simulated, call):
     assert replayed['requirements'] == simulated['requirements']
     again = call('replay', 'r.mcap', '--reschedule', '--json', '-').result
     assert again['requirements'] == again['recorded']['requirements'] == simulated['requirements']
-    # left out are the changes after 0 to 40, and the outputs with the inputs of 10 and 30
+    # without the changes after 0 to 40, and the outputs with the inputs of 10 and 30
     skipped = call('replay', 'r.mcap', '--from', '50ms', '--json', '-').result
     assert counts(skipped) == {'reaction': (6, 6, 1, 0, 33), 'age': (7, 0, 0, 0, 13)}
     assert skipped['paths']['imu_to_wheels']['flows'] == 15

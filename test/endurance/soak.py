@@ -21,7 +21,7 @@ At the end these have to hold: memory in use within 5 % of what it was after the
 threads and file handles; every execution that became ready ran, was dropped, or is one of those
 that wait; every job ended or is open; and no deadline is missed by a job that was released in a
 clean window.
-Not judged are sinks whose critical path in this draw leaves less than ``LEAST_SLACK`` of the
+It does not judge sinks whose critical path in this draw leaves less than ``LEAST_SLACK`` of the
 deadline for waits (``unjudged_sinks`` in the result: no policy keeps these), and windows in which
 the machine stopped: another process, which only sleeps, was woken more than ``STALL_S`` late.
 """
