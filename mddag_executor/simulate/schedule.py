@@ -124,12 +124,13 @@ class Scheduled(NamedTuple):
         tally.jobs = np.bincount(
             dags[judged].astype(np.int64), minlength=len(tally.jobs)).tolist()
         decisions = np.asarray(self.decisions, dtype=np.int64).reshape(-1, 6)
-        kind = decisions[:, 0]
-        kinds, _, *results = decisions[kind < JOB_END].T
-        tally.add_results(kinds, *results)
+        # column by column: most rows are chosen, so their copies are large
+        kind, dag, place, _, how, _ = decisions.T
+        results = np.flatnonzero(kind < JOB_END)
+        tally.add_results(*(decisions[results, column] for column in (0, 2, 3, 4, 5)))
         tally.add(decisions[kind == SINK_DEMOTED].tolist())
-        ends = decisions[(kind == JOB_END) & (decisions[:, 2] != NOT_JUDGED)]
-        pairs, numbers = np.unique(ends[:, 1] << 8 | ends[:, 4], return_counts=True)
+        ends = np.flatnonzero((kind == JOB_END) & (place != NOT_JUDGED))
+        pairs, numbers = np.unique(dag[ends] << 8 | how[ends], return_counts=True)
         for pair, number in zip(pairs.tolist(), numbers.tolist()):
             tally.ends[pair >> 8][pair & 255] = number
 

@@ -19,6 +19,7 @@ import os
 
 from mddag_executor import defaults
 from mddag_executor.core import DEFAULT_DEADLINE_NS
+from mddag_executor.memory import give_back
 from mddag_executor.recording.columns import concatenate, Ints, rows
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.joins import sort_by
@@ -124,6 +125,8 @@ def read_bag(
             'give the graph of the nodes that were recorded')
     releases = releases[sort_by(*(releases[name] for name in ('noticed', 'dag', 'job')))]
     releases['order'] = np.arange(len(releases))
+    del parts
+    give_back()     # messages that were read
     workers = defaults.workers(None, task_set)
     end = (bag.end or 0) + 1
     run = Run(

@@ -74,7 +74,7 @@ class ComputedRun(NamedTuple):
     horizon: int
     end: int
     judged: bool = True
-    numbers: Sequence[Sequence[int]] | None = None
+    numbers: Sequence[Ints] | None = None
     judge_from: int = -NEVER
     judged_releases: tuple[int, int] | None = None
 
@@ -175,7 +175,7 @@ class _Tables:
         found = job.copy()
         for number, recorded in enumerate(self._schedule.numbers or ()):
             mine = dag == number
-            found[mine] = np.asarray(recorded, dtype=np.int64)[job[mine]]
+            found[mine] = recorded[job[mine]]
         return found
 
     def in_order(self) -> tuple[Table, Table, Table]:

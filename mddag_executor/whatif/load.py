@@ -76,7 +76,7 @@ class RecordedLoad(NamedTuple):
     """
 
     load: Load
-    jobs: Sequence[Sequence[int]]
+    jobs: Sequence[Ints]
     demand: int
     executions: int
     estimated: int
@@ -399,7 +399,7 @@ class LoadBuilder:
         load = self._load(costs, others[:, 0], overheads, workers == 1)
         return RecordedLoad(
             load._replace(fates=self._fates(len(costs)), **columns),
-            [jobs.tolist() for jobs in self._numbers], demand, executions, estimated, unknown,
+            self._numbers, demand, executions, estimated, unknown,
             usual, transport, late if overheads else late[:0])
 
     def _unsent(self) -> list[Any]:
@@ -501,18 +501,21 @@ class LoadBuilder:
             took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)
 
     def _load(self, costs: Any, others: Ints, overheads: bool, one_worker: bool) -> Load:
-        # ready, DAG, row of the job in its DAG, release
         n_dags = len(self._numbers)
-        parts = [np.column_stack((
-            others, np.full(len(others), n_dags), np.arange(len(others)), others))]
+        counts = [len(others), *map(len, self._numbers)]
+        releases, times = [others], [others]
         for dag in range(n_dags):
             release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
-            ready = release if self._timer[dag] and not overheads else np.where(
-                (turn >= 0) | one_worker & (busy > 0), release, noticed)
-            parts.append(np.column_stack((
-                ready, np.full(len(ready), dag), np.arange(len(ready)), release)))
-        columns = np.concatenate(parts).T
-        ready, dags, rows, release = columns[:, np.lexsort(columns[::-1])]
+            releases.append(release)
+            times.append(release if self._timer[dag] and not overheads else np.where(
+                (turn >= 0) | one_worker & (busy > 0), release, noticed))
+        ready = np.concatenate(times)
+        dags = np.repeat(np.array([n_dags, *range(n_dags)]), counts)
+        rows = np.concatenate([np.arange(count) for count in counts])
+        order = sort_by(ready, dags, rows)
+        columns: list[Any] = [
+            column[order] for column in (ready, dags, rows, np.concatenate(releases))]
+        ready, dags, rows, release = columns
         return Load(ready, dags, rows, costs, self._begins[_VERTEX].tolist(),
                     [*self._widths[_VERTEX].tolist(), 1], release)
 

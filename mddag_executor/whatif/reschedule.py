@@ -112,7 +112,7 @@ class Reschedule:
         miss = verdicts['first_miss']
         if miss is not None:
             dag = self.task_set.dag(miss['dag']).index
-            miss = {**miss, 'job': work.jobs[dag][miss['job']]}
+            miss = {**miss, 'job': int(work.jobs[dag][miss['job']])}
         cpus: RescheduleResultRare = {}
         processes: RescheduleResultRare = {}
         skips: RescheduleResultRare = {}
