@@ -264,8 +264,10 @@ class Paths:
     def _ran(self, callback: Callback) -> tuple[Executions, Ends]:
         """Return the executions of a callback, and the ends of their pieces."""
         rows: Any = self._of_place[self._places[callback.key]]
-        table = self._table[['start', 'end', 'callback', 'job']][rows]
+        table = self._table[['start', 'end', 'callback', 'job', 'worker']][rows]
         started = table['start'] >= 0
+        if not self._recording.run.imported:    # those that waited at the end have no worker
+            started &= (table['end'] >= 0) | (table['worker'] >= 0)
         ended = np.flatnonzero(started & (table['end'] >= 0))
         ended = ended[sort_by(table['end'][ended])]
         mine = np.flatnonzero(started & (self._first(rows) == rows))

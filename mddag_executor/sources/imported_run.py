@@ -11,7 +11,9 @@ Executions are linked with messages (``links``), and assigned to jobs (``importe
 1. *Releases.*  A timer is due at t_init + n * period.  rcl keeps this grid even if a timer is more
    than a period late: it skips the missed times.  The release of an execution is the last due time
    at its start.  `rcl_timer_init` is recorded shortly after the timer has read its clock, so an
-   execution that starts up to `_SLACK_NS` before a due time also has that release, at its start.
+   execution that starts up to `_SLACK_NS` before a due time also has that release, at its start;
+   but if no execution has the due time before, and the next execution has this one, or few start
+   so early, it was late.
    If t_init is unknown, or an earlier execution has the same release (the timer was reset, or
    uses another clock), the release is the start; a warning reports it. A subscription or service
    without publisher in the graph is released as declared: by header stamp, source timestamp, or
@@ -335,7 +337,7 @@ class ImportedRun:
             if grid is None or abs(grid) >= NEVER or period <= 0:
                 self._odd.count('off', timer.label, len(mine))
                 continue
-            n = (time[mine] - grid + min(_SLACK_NS, period // 10)) // period
+            n = _due_times(time[mine] - grid, period)
             newer = n > np.maximum.accumulate(np.append(0, n))[:-1]
             mine, n = mine[newer], n[newer]
             due[mine] = np.minimum(grid + n * period, time[mine])
@@ -390,6 +392,27 @@ def process_names(pids: Sequence[int], names: Mapping[tuple[int, int], str]) -> 
              for pid in pids]
     return [name if plain.count(name) == 1 and name != 'process' else f'{name}_{pid}'
             for name, pid in zip(plain, pids)]
+
+
+def _due_times(since: Ints, period: int) -> Ints:
+    """
+    Return which due times of a timer its executions have (rule 1).
+
+    :param since: when they started, since the recorded begin of the grid, in order.
+    """
+    slack = min(_SLACK_NS, period // 10)
+    started, phase = np.divmod(since, period)
+    found: Ints = (since + slack) // period
+    is_early = found > started
+    # A grid that was recorded late makes most executions near a due time early, and more than
+    # those that are late by any time at all.
+    early = int(is_early.sum())
+    are_few = (2 * early < int((is_early | (phase < slack)).sum())
+               or early * period < 2 * slack * len(since))
+    is_twice = np.append(found[1:] == found[:-1], False)
+    is_free = np.append(started[:1] > 0, found[:-1] < started[1:])
+    times: Ints = np.where(is_early & is_free & (is_twice | are_few), started, found)
+    return times
 
 
 def _arrival(runs: Table) -> Ints:

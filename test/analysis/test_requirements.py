@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from ..declared_path import imu_to_wheels
-from ..sources.helpers import MS
+from ..sources.helpers import MS, ns, Written
 from .path_systems import random_system, simulated_run
 from .told import Told
 
@@ -126,6 +126,18 @@ def test_a_dead_path_is_late(tmp_path):
     found = counts(replay(told.write(), told.task_set).result())
     # the run ends at 192; the outputs at 9, 29, 49, 69 and 89 have the inputs of 0, 20, … 80
     assert found == {'reaction': (8, 0, 9, 0, 29), 'age': (5, 0, 4, 0, 9)}
+
+
+def test_what_waited_at_the_end_was_no_input(tmp_path):
+    """The executor records it as dispatched without a worker; a run does not count it either."""
+    trace = Written(tmp_path / 'r.mcap', GRAPH, workers=1)
+    trace.release(0, 0, 0)
+    trace.run(0, 0, 0, 0, 1)
+    trace.run(0, 1, 0, 1, 2)
+    trace.release(0, 1, 10)
+    trace.add('dispatch', 100, 1000, 0, 0, 1, -1, ns(10), 0)
+    found = replay(trace.end(100)).result()['requirements']['imu_to_wheels']['reaction']
+    assert (found['completed'], found['late']) == (0, 0)
 
 
 def test_outputs_that_do_not_come_for_years_are_only_counted(tmp_path):

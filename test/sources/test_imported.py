@@ -167,6 +167,26 @@ def test_late_and_off_the_grid(tmp_path):
         'lost): without a job: /n timer 10ms (2)']
 
 
+@pytest.mark.parametrize('starts', [
+    (10_000, 29_400, 30_100, 39_800, 49_800), (10_000, 29_400, 40_100, 50_100, 60_100, 70_200)],
+    ids=['the next one has its own', 'few start so early'])
+def test_an_execution_that_is_late_by_nearly_a_period(starts, tmp_path):
+    """It starts shortly before the next due time (us), but does not have it."""
+    graph = loads('mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n'
+                  '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'graph.yaml')
+    r = Recorded(tmp_path / 'timer.mcap')
+    r.node(1, '/n')
+    r.timer(GRAB, 1, 10 * MS)
+    for start in starts:
+        r.run(GRAB, 1, start * US, (start + 500) * US)
+    result, warnings = result_of(r.write(), graph)
+    sink = result['dags']['/n']['sinks']['/n:t']
+    assert (sink['completed'], sink['late']) == (len(starts), 1)
+    assert sink['response_ns']['max'] == 9_900 * US
+    assert result['first_miss']['job'] == 1
+    assert [line for line in warnings if 'off the grid' in line] == []
+
+
 def two_computers(path, skew=0, back=False, ways=2 * MS):
     """Write a camera, and on another computer, whose clock is behind, what detects and plans."""
     r = Recorded(path)
