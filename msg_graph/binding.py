@@ -36,6 +36,7 @@ _WORDS = {'subscription': 'topic', 'service': 'service'}
 _PYTHON = re.compile(r'(?:[\w<>]+\.)*(\w+|<lambda>)')
 _CPP = re.compile(r'[\w:<>*& ]*?\b(\w+)\([^()]*\)')
 _BACKGROUND_TOPICS = {'/rosout', '/parameter_events', '/clock', '/diagnostics'}
+_ANNOUNCEMENTS = '/mddag/jobs_'  # with them the processes of a run find each other's jobs
 _BACKGROUND_SERVICES = {
     'describe_parameters', 'get_parameter_types', 'get_parameters', 'list_parameters',
     'set_parameters', 'set_parameters_atomically', 'get_type_description',
@@ -186,10 +187,11 @@ def entity_name(node: str, symbol: str, what: str) -> str:
 
 def is_background(name: str, node: str) -> bool:
     """
-    Return whether a topic or service belongs to the client library or to an action.
+    Return whether a topic or service belongs to the client library, the executor or an action.
 
     Every node or lifecycle node has some of these; declarations do not contain them.
     """
     before, _, word = name.rpartition('/')
-    return (name in _BACKGROUND_TOPICS or '/_action/' in name or word in _BACKGROUND_SERVICES
+    return (name in _BACKGROUND_TOPICS or name.startswith(_ANNOUNCEMENTS)
+            or '/_action/' in name or word in _BACKGROUND_SERVICES
             or (word in _LIFECYCLE and before == node))

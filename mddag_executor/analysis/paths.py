@@ -24,10 +24,11 @@ reads a value again.  A flow that does not arrive is dropped if another branch o
 execution continued.
 
 An execution of a job was started by the message that the previous vertex published in the same
-job.  The topic that started a leg of a sync callback is that of its subscription.  A simulated
-trace has no publications: each topic counts as published when the callback ends.  In an imported
-recording the tables link messages and executions.  An execution of several pieces (a coroutine) is
-one, from its first start to its last end.
+job.  The topic that started a leg of a sync callback is that of its subscription.  A computed run
+has no publications: each topic counts as published when the callback ends, or before that if a
+callback that it starts was ready earlier.  In an imported recording the tables link messages and
+executions.  An execution of several pieces (a coroutine) is one, from its first start to its last
+end.
 
 A *step* is an execution or a publication at a position of a path; its parent is the step whose
 data it has.  A flow is a branch from a step without parent to one without children.  All steps of
@@ -218,12 +219,33 @@ class Paths:
                 found.append(self._recorded(callback, topic, self._of_topic[topic]))
                 continue
             found.append(rows(
-                _SENT, len(ended.rows), known=True, run=self._first(ended.rows), time=ended.time,
+                _SENT, len(ended.rows), known=True, run=self._first(ended.rows),
+                time=self._sent_at(callback, topic, ended),
                 message=self._message(ended.job, self._vertex[ended.rows], topic)
                 )[self._is_sent(callback, topic, ended)])
         sent = concatenate(found)
         time = sent['time']
         return sent[sort_by(time)] if (time[1:] < time[:-1]).any() else sent
+
+    def _sent_at(self, callback: Callback, topic: int, ended: Ends) -> Ints:
+        """Return when executions of a computed run published a topic: at their ends or before."""
+        found, by, started = ended.time.copy(), self._vertex[ended.rows], self._table['start'] >= 0
+        for number, before in enumerate(self._task_set.vertices):
+            if before.callback is not callback:
+                continue
+            mine = np.flatnonzero(by == number)
+            for place in before.successors:
+                after = number - before.index + place
+                topics = self._task_set.vertices[after].callback.topics
+                if topic not in map(self._topics.get, topics):
+                    continue
+                begun = np.flatnonzero((self._vertex == after) & started)
+                at = equal(self._table['job'][begun], ended.job[mine])
+                known = at >= 0
+                published = mine[known]
+                found[published] = np.minimum(
+                    found[published], self._table['ready'][begun[at[known]]])
+        return found
 
     def _is_sent(self, callback: Callback, topic: int, ended: Ends) -> Mask:
         """Return in which executions a callback of a computed run published a topic."""

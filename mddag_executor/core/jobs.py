@@ -90,10 +90,13 @@ def source_depth(t: Tables, s: State, dag: int) -> int:
     """
     Return how many releases of a timer source may wait: as many as can be in time.
 
-    If its executions drop older ones, the last release may do so before it counts (rule 11).
+    They take no more than half of the open jobs: else a job would expire (rule 1) before its
+    source has run, and its messages would belong to no job.  If its executions drop older ones,
+    the last release may do so before it counts (rule 11).
     """
     drops = t.keep[t.source[dag]] == KEEP_NEWEST or demotes(t, s, dag)
-    return max(1, -(-t.dag_deadline[dag] // t.period[dag])) + int(drops)
+    in_time = -(-t.dag_deadline[dag] // t.period[dag])
+    return max(1, min(in_time, t.max_active_jobs[dag] // 2)) + int(drops)
 
 
 def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:

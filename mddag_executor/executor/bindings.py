@@ -155,7 +155,8 @@ class Bindings:
         assert self._task_set is not None and self._binder is not None
         elsewhere = self.elsewhere(process)
         return [callback for callback in self._binder.unbound()
-                if callback.key not in elsewhere and not may_run_elsewhere(
+                if callback.key not in elsewhere and callback.key not in self._found
+                and not callback.once and not may_run_elsewhere(
                     callback, self._dags.get(callback.key, ()), nodes, self._task_set)]
 
     def unbound_text(

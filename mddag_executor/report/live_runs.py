@@ -54,9 +54,11 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
             ('run of callbacks that raised', 'runs of callbacks that raised',
              _numbers(callbacks, 'failed')),
             ('timer release skipped', 'timer releases skipped', _numbers(callbacks, 'skipped')),
+            ('message without a job', 'messages without a job',
+             _numbers(callbacks, 'unattributed')),
             ('run of undeclared callbacks', 'runs of undeclared callbacks', {
-                name: count for name, each in callbacks.items()
-                if (count := each['unattributed' if each['declared'] else 'ran'])})):
+                name: each['ran'] for name, each in callbacks.items()
+                if each['ran'] and not each['declared']})):
         if numbers:
             names = [f'{name} {n}' for name, n in numbers.items()]
             # without a declaration they are all that there is to see
@@ -121,7 +123,7 @@ def _absent(dags: dict[str, Any]) -> Iterator[str]:
     absent = [
         f'{sink} {missing} of {dag["jobs"]}' for dag in dags.values()
         for sink, verdicts in dag['sinks'].items()
-        if (missing := dag['jobs'] - counts(verdicts).due) > 1]
+        if (missing := dag['jobs'] - counts(verdicts).due - counts(verdicts).not_due) > 1]
     if absent:
         yield ('jobs that did not come to their sinks, or whose process died with the count (a '
                f'replay of the traces shows why): {listed(absent)}')

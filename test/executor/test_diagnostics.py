@@ -272,6 +272,62 @@ def test_a_wrong_name_is_warned_of_once(
             in live_lines({**executor.statistics(), **never_started}))
 
 
+def test_timers_that_fire_once_need_not_exist_all_the_time(
+        make_executor, make_node, capfd, monkeypatch):
+    """One has fired and is destroyed, and the other one is made later."""
+    monkeypatch.setattr('mddag_executor.executor.bindings.LEAST_S', 0.3)
+    node, later = make_node('mission'), Future()
+
+    def arm():
+        node.destroy_timer(first)
+        node.create_timer(0.7, lambda: later.set_result(True))
+
+    first = node.create_timer(0.05, arm)
+    executor = make_executor(loads("""\
+mddag: 1
+nodes:
+  - node: /mission
+    callbacks:
+      - {name: arm, timer: 50ms, once: true, deadline: 1s}
+      - {name: start, timer: 700ms, once: true, deadline: 1s}
+      - {name: end, timer: 5s, once: true, deadline: 1s}
+""", 'mission.yaml'), nodes=[node])
+    executor.spin_until_future_complete(later, 30.0)
+    executor.shutdown()
+    assert later.done()
+    assert 'found in no node' not in capfd.readouterr().err
+    assert list(executor.statistics()['not_found']) == ['/mission:end']
+
+
+def test_jobs_that_did_not_come_are_those_that_were_due(make_executor, make_node):
+    detector = make_node('detector')
+    detector.create_subscription(String, '/image', print, 10)
+    executor = make_executor(loads(CAMERA), nodes=[detector])
+    wait_for(lambda: executor.statistics()['callbacks'])
+    result = {**executor.statistics(), 'processes': [], 'measured': None}
+    dag = result['dags']['vision']
+    dag['jobs'] = 150
+    dag['sinks']['/detector:detect'].update(completed=56, not_due=93)
+    assert not [line for line in live_lines(result) if 'did not come' in line]
+    dag['sinks']['/detector:detect'].update(not_due=90)
+    line, = (line for line in live_lines(result) if 'did not come' in line)
+    assert line.endswith(': /detector:detect 4 of 150')
+
+
+def test_messages_without_a_job_are_no_runs(make_executor, make_node):
+    """Some of them may have been dropped."""
+    camera, detector = make_node('camera'), make_node('detector')
+    publisher, heard = camera.create_publisher(String, '/image', 10), []
+    detector.create_subscription(String, '/image', heard.append, 10)
+    executor = make_executor(loads(CAMERA), nodes=[detector])
+    publisher.publish(String())     # outside of callbacks
+    with Spinning(executor):
+        assert wait_for(lambda: heard)
+    lines = list(live_lines({**executor.statistics(), 'measured': None}))
+    assert '1 message without a job: /detector:detect 1' in lines
+    assert not [line for line in lines if 'undeclared' in line]
+
+
 def test_all_callbacks_of_a_run_without_a_declaration_are_listed(make_executor, make_node):
     node, ran = make_node('many'), []
     for _ in range(14):

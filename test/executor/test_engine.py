@@ -147,6 +147,31 @@ def test_which_releases_of_a_timer_give_way_to_newer_ones(keys, release, dropped
     assert (timer.dropped, timer.skipped) == (dropped, 0 if dropped else 2)
 
 
+@pytest.mark.parametrize('deadline', ['none', '1s'])
+def test_the_job_of_a_waiting_release_does_not_end_before_its_source_runs(deadline):
+    """200 releases could be in time, and 64 jobs may be open."""
+    task_set = loads(graph(
+        imu='name: sample, timer: 5ms, publishes: [/imu], max_active_jobs: 64',
+        filter=f'name: store, subscription: /imu, deadline: {deadline}'))
+    engine = new_engine(task_set, on_late='demote')
+    timer, store = entity_of(engine, task_set, 0, 0), entity_of(engine, task_set, 0, 1)
+    timer.depth = source_depth(engine.tables, engine.scheduler.state, 0)
+    store.depth = 5
+    for due in range(0, 500 * MS, 5 * MS):
+        engine.timer_due(Work(timer, print), due, due)
+    ran = []
+    for now in range(500 * MS, 520 * MS, MS):
+        work = engine.step(0, now).work
+        ran.append(work.entity)
+        assert engine.open_release(work.origin) is not None
+        engine.finished(work, now, now, now, 0, 0)
+        if work.entity is timer:
+            engine.arrived(Work(store, print), work.origin, -1, -1, now)
+        check(engine)
+    assert set(ran) == {timer, store}
+    assert store.unattributed == 0
+
+
 @pytest.mark.parametrize('reported_at', [41, 45])
 def test_a_sink_that_ended_in_time_is_in_time_also_if_it_was_reported_overdue(reported_at):
     """Its thread could report the end only after the deadline."""

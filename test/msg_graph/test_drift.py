@@ -58,7 +58,7 @@ SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
 
 
 @pytest.mark.parametrize(('changes', 'texts'), [
-    ({'publishes': {'/b:w': {'/q\x1b', '/p', '/parameter_events'}}},
+    ({'publishes': {'/b:w': {'/q\x1b', '/p', '/parameter_events', '/mddag/jobs_1f/p0'}}},
      ['/b:w publishes /p, which it does not declare',
       '/b:w publishes /q\\x1b, which it does not declare']),
     ({'periods': {'/a:t': 10 * MS}}, []), ({'periods': {'/a:t': 10_010_000}}, []),

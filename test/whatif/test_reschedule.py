@@ -336,6 +336,38 @@ def test_computed_tables_know_messages_that_were_not_published(tmp_path):
     assert (sink['completed'], sink['not_due']) == (4, 6)
 
 
+def test_paths_know_messages_that_arrived_before_their_callback_ended(tmp_path, call):
+    """With two workers the next callback starts while the one that has published still runs."""
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+nodes:
+  - {node: /camera, callbacks: [{name: grab, timer: 50ms, publishes: [/image]}]}
+  - {node: /detect, callbacks: [{name: run, subscription: /image, deadline: 30ms}]}
+  - {node: /arm, callbacks: [{name: move, timer: 50ms, reads: [/image], deadline: 50ms}]}
+paths:
+  - {name: started, callbacks: ['/camera:grab', '/detect:run'], reaction: 90ms, age: 25ms}
+  - {name: read, callbacks: ['/camera:grab', '/arm:move'], reaction: 120ms, age: 70ms}
+""", 2)
+    trace.add('rcl_publisher_init', 0, 51, 1, 51, '/image', 10)
+    for job, at in enumerate(range(0, 1000, 50)):
+        trace.release(0, job, at)
+        trace.release(1, job, at + 4)
+        trace.add('rclcpp_publish', at + 2, 51, 0, 0, thread=10)
+        trace.run(0, 0, job, at, at + 8)
+        trace.run(0, 1, job, at + 3, at + 20, ready=at + 3, worker=1)
+        trace.run(1, 0, job, at + 8, at + 9, ready=at + 4)
+    path = trace.end(1000)
+    results = [call('replay', path, *options, '--json', '-').result['requirements']
+               for options in ([], ['--reschedule'], ['--reschedule', '--workers', '3'])]
+    figures = [{(name, what): (each['completed'], each['late'], each['response_ns']['median'])
+                for name, of in result.items() for what, each in of.items()}
+               for result in results]
+    assert figures[0] == figures[1] == {
+        ('started', 'reaction'): (19, 0, 70 * MS), ('started', 'age'): (20, 0, 20 * MS),
+        ('read', 'reaction'): (19, 0, 59 * MS), ('read', 'age'): (20, 0, 9 * MS)}
+    assert figures[2]['read', 'age'] == (20, 0, 5 * MS)     # a worker was free at 4 ms
+
+
 # --- overheads -----------------------------------------------------------------------------------
 
 def test_timers_that_were_noticed_late_because_no_worker_was_idle_are_noticed_with_more(tmp_path):
