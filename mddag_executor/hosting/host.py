@@ -18,6 +18,7 @@ Theory of operation
    its ``shutdown``                   called by a program's thread, ends that program; called by
                                       any other thread (in a callback), ends the run
    its ``ok``                         is also False in the threads of a program that has ended
+   ``Node.__init__``                  adds the program's own arguments for rclpy to the node's
    ``Node.create_timer``, …           note that the program uses the node
    ``Executor.__init__``              makes a ``GuestExecutor`` of the executor
    ``get_global_executor``            returns a ``GuestExecutor`` of the calling program
@@ -145,6 +146,7 @@ class Host:
         replace(Executor, '__init__', self._executor_init)
         replace(Context, 'init', self._init_other)
         replace(threading.Thread, 'start', self._thread_start)
+        replace(Node, '__init__', self._node_init)
         for name in _MAKE_CALLBACKS:
             replace(Node, name, self._of_user)
         for package in ('rclpy.experimental', 'rclpy.experimental.events_executor'):
@@ -600,6 +602,28 @@ class Host:
             return original(node, *args, **more)
 
         return make
+
+    def _node_init(self, original: Callable[..., None]) -> Callable[..., None]:
+        def init(
+            node: Node, *args: Any, cli_args: list[str] | None = None,
+            use_global_arguments: bool = True, **more: Any,
+        ) -> None:
+            guest = self.current_guest() or self._guest_of_callback()
+            is_of_run = more.get('context') in (None, self.context)
+            if guest is not None and is_of_run and use_global_arguments:
+                # first those of the node's own: the first rule that fits remaps a name
+                cli_args = [*(cli_args or ()), *guest.program.ros_arguments] or None
+            original(node, *args, cli_args=cli_args, use_global_arguments=use_global_arguments,
+                     **more)
+
+        return init
+
+    def _guest_of_callback(self) -> Guest | None:
+        """Return the program whose callback the calling thread runs, or None."""
+        running = current.running
+        work = None if running is None else running.work
+        executor = None if work is None else self._executor_of_group.get(work.entity.outer)
+        return None if executor is None else executor.guest
 
     def _thread_start(self, original: Callable[..., None]) -> Callable[..., None]:
         def start(thread: threading.Thread) -> None:

@@ -23,6 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 import inspect
+from itertools import dropwhile
 import os
 from pathlib import Path
 import shlex
@@ -40,6 +41,12 @@ from mddag_executor.errors import MddagError, UserCodeError
 from mddag_executor.hosting.run_options import spec_of
 from msg_graph.errors import did_you_mean
 from rclpy.node import Node
+
+_ROS_ARGS = '--ros-args'
+_OF_PROCESS = {  # arguments of rclpy that no node can have alone
+    '--log-level', '--log-config-file', '--log-file-name', '--disable-external-lib-logs',
+    '--disable-rosout-logs', '--disable-stdout-logs', '--enable-external-lib-logs',
+    '--enable-rosout-logs', '--enable-stdout-logs'}
 
 
 class LoadingError(MddagError):
@@ -70,6 +77,11 @@ class Program:
     run: Callable[[], Any]
     arguments: tuple[str, ...] = ()
 
+    @property
+    def ros_arguments(self) -> list[str]:
+        """Its arguments for rclpy, from ``--ros-args`` on, which are those of its nodes alone."""
+        return [*dropwhile(lambda word: word != _ROS_ARGS, self.arguments)]
+
 
 class MainFailed(UserCodeError):
     """A program whose main raised, which is the cause; the status is Python's."""
@@ -96,10 +108,12 @@ def resolve(
         spec, *arguments = shlex.split(text) or ['']
     except ValueError as error:
         raise LoadingError(text, f'its quotes are not right ({error})', 'correct them') from None
-    if '--ros-args' in arguments:
+    of_process = sorted(_OF_PROCESS.intersection(
+        dropwhile(lambda word: word != _ROS_ARGS, arguments)))
+    if of_process:
         raise LoadingError(
-            text, 'all nodes of this process share its ROS arguments',
-            'put --ros-args at the end of the command line')
+            text, f'all nodes of this process share {of_process[0]}',
+            'put it after a --ros-args at the end of the command line')
     argv = sys.argv
     sys.argv = [spec.partition(':')[0].rpartition('/')[2], *arguments, *ros_arguments]
     try:
@@ -110,7 +124,7 @@ def resolve(
 
 def ros_arguments(given: Sequence[str] | None) -> list[str]:
     """Return the ``--ros-args`` for programs and rclpy."""
-    return ['--ros-args', *given] if given else []
+    return [_ROS_ARGS, *given] if given else []
 
 
 def _find(spec: str) -> Program:

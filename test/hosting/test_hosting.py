@@ -325,6 +325,39 @@ def test_what_does_not_end_is_left_behind(world):
         assert line in done.stderr.splitlines()
 
 
+def test_each_program_has_ros_arguments_of_its_own(world, mddag):
+    """Those of the command line hold for all. A node made in a callback has them as well."""
+    (world / 'lidar.py').write_text("""
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import Header
+
+class Lidar(Node):
+    def __init__(self, name='lidar', **more):
+        super().__init__(name, **more)
+        rate = self.declare_parameter('rate', 10).value
+        scans = self.create_publisher(Header, 'scan', 1)
+        print(self.get_fully_qualified_name(), scans.topic_name, rate, flush=True)
+
+def main():
+    rclpy.init()
+    node, others = Lidar(), []
+    own = Lidar('own', cli_args=['--ros-args', '-r', '__ns:=/own'])
+    apart = Lidar('apart', use_global_arguments=False)
+    node.create_timer(0.05, lambda: others or others.append(Lidar('later')))
+    rclpy.spin(node)
+""")
+    done = mddag(
+        'run', '--node', 'lidar:main --ros-args -r __ns:=/front -p rate:=20',
+        '--node', 'lidar:main --ros-args -r __ns:=/back', '--duration', '1s', '--trace', 't.mcap',
+        '--ros-args', '-r', 'scan:=cloud')
+    assert done.returncode == 0, done.stderr
+    assert {line for line in done.stdout.splitlines() if line.startswith('/')} >= {
+        '/front/lidar /front/cloud 20', '/back/lidar /back/cloud 10',
+        '/front/later /front/cloud 20', '/back/later /back/cloud 10',
+        '/own/own /own/cloud 20', '/own/own /own/cloud 10', '/apart /scan 10'}
+
+
 @pytest.fixture
 def default_context(no_thread_leak):
     """Initialise the default context, in which programs are hosted."""
