@@ -61,10 +61,16 @@ class Stops:
         self._count += 1
         self._total_ns += end - begin
         self._latest.append((begin, end))
-        waiting = [(miss.is_explained_by(begin, end), miss) for miss in self._unexplained]
-        self._unexplained = deque((miss for is_one, miss in waiting if not is_one), KEEP_MISSES)
-        self._misses += sum(is_one for is_one, _ in waiting)
-        return [miss.what for is_one, miss in waiting if is_one]
+        found: list[Any] = []
+        left: deque[_Miss] = deque(maxlen=KEEP_MISSES)
+        for miss in self._unexplained:
+            if miss.is_explained_by(begin, end):
+                found.append(miss.what)
+            elif max(miss.release, miss.completed) >= end:
+                left.append(miss)  # else no later stop explains it
+        self._unexplained = left
+        self._misses += len(found)
+        return found
 
     def missed(self, release: int, deadline: int, completed: int, what: Any = None) -> bool:
         """
