@@ -245,7 +245,7 @@ class Announcements:
             work.entity.topic, info['source_timestamp'],
             info.get('publication_sequence_number'), counted)
 
-    def take(self, work: Work, info: dict[str, Any], now: int) -> None:
+    def receive(self, work: Work, info: dict[str, Any], now: int) -> None:
         """Handle a message that may be of another process; pass it on when its job is known."""
         if work.entity.topic in self._contested:
             self._attribution.doubtful += 1

@@ -51,7 +51,7 @@ class Clocked(Threads, Protocol):
     timers: TimerQueue
     unlocked_calls: deque[Callable[[], None]]
     running: bool
-    is_stepping: bool
+    is_spin_once: bool
     polling: int
     context: Any
     wake_executor: Callable[[], None]
@@ -166,10 +166,10 @@ class DueTimes:
     def arm(self, now: int) -> None:
         """Set the time at which a thread wakes up: one in the epoll, else a parked one."""
         pool = self._pool
-        if not pool.polling and not pool.is_stepping:
+        if not pool.polling and not pool.is_spin_once:
             self._timer.at = NEVER  # it may expire, and wakes no thread then
             if pool.running and pool.engine.is_busy:
-                self.look(now)
+                self.arm_look(now)
         elif not pool.running:
             self._timer.arm(NEVER)
         else:
@@ -185,7 +185,7 @@ class DueTimes:
 
         The caller starts nothing, so the time of a look that was set before stays.
         """
-        if self._pool.polling or self._pool.is_stepping:
+        if self._pool.polling or self._pool.is_spin_once:
             self.arm_by(self._agenda.first())
         elif self._pool.running and self._pool.engine.is_busy:
             self.arm_by(self._next_look(now))
@@ -204,7 +204,7 @@ class DueTimes:
 
     def arm_by(self, at: int) -> None:
         """Let a thread wake up at a time, unless it does sooner."""
-        if self._pool.polling or self._pool.is_stepping:
+        if self._pool.polling or self._pool.is_spin_once:
             if at < self._timer.at:
                 self._timer.arm(at)
         elif at < self._watch.at:
@@ -225,7 +225,7 @@ class DueTimes:
         """Note that something may arrive at an entity from outside."""
         self._allowance = min(self._allowance, max(SOON_NS, self.allowance(entity)))
 
-    def look(self, now: int) -> None:
+    def arm_look(self, now: int) -> None:
         """Set the time of the next look while callbacks run and no thread waits for events."""
         self.check.note(now)
         at = self._next_look(now)
@@ -235,7 +235,7 @@ class DueTimes:
     def _next_look(self, now: int) -> int:
         return min(self._agenda.first_latest(), now + self._allowance)
 
-    def look_after(self, now: int, patience: int) -> None:
+    def arm_late_look(self, now: int, patience: int) -> None:
         """
         Set the time of a look in case that a short callback runs longer than expected.
 
@@ -267,4 +267,4 @@ class DueTimes:
             waited = self._pool.waited_since(since) - self._offset
             late = now - max(at, seen, waited) - (cpu - used)
             if late >= STOP_NS:
-                self._pool.engine.stopped(now - late + self._offset, now + self._offset)
+                self._pool.engine.machine_stopped(now - late + self._offset, now + self._offset)

@@ -40,7 +40,7 @@ class Ending:
     Ends the parts of an executor, each once.
 
     :ivar is_asked: whether the executor has been asked to end.
-    :ivar stepping: the epoll of ``spin_once``, once there is one.
+    :ivar spin_once_epoll: the epoll of ``spin_once``, once there is one.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Ending:
         notifier: MissNotifier | None,
     ) -> None:
         self.is_asked = False
-        self.stepping: select.epoll | None = None
+        self.spin_once_epoll: select.epoll | None = None
         self.wait_sets: WaitSetThread | None = None
         self.upkeep: Upkeep | None = None
         self.diagnostics: Diagnostics | None = None
@@ -100,8 +100,8 @@ class Ending:
                     self._close_descriptors()
 
     def _close_descriptors(self) -> None:
-        if self.stepping is not None:
-            self.stepping.close()
+        if self.spin_once_epoll is not None:
+            self.spin_once_epoll.close()
         self._pool.loop.close()
         self._at_once.loop.close()
         self._pool.parking.close()

@@ -172,20 +172,20 @@ class Engine:
 
     # --- ready work ------------------------------------------------------------------------------
 
-    def taken(
+    def message_taken(
         self, entity: Entity, message: Any, source_timestamp: int, number: int | None, now: int
     ) -> None:
-        """Record that a message was taken, while ``record`` is set (``RunRecords.take``)."""
+        """Record that a message was taken, while ``record`` is set (see ``RunRecords``)."""
         assert self._records is not None
-        self._records.take(entity, message, source_timestamp, number, now)
+        self._records.message_taken(entity, message, source_timestamp, number, now)
 
-    def never_taken(self, entity: Entity, count: int, now: int) -> None:
+    def messages_lost(self, entity: Entity, count: int, now: int) -> None:
         """Note that the middleware dropped messages (see ``gaps``), as the next one shows."""
         if entity.is_own:
             return
         entity.lost += count
         if self._records is not None:
-            self._records.lost(entity, count, now)
+            self._records.messages_lost(entity, count, now)
 
     def timer_due(self, work: Work, due: int, now: int) -> None:
         """Handle a timer that became due at ``due``."""
@@ -492,7 +492,7 @@ class Engine:
             step.patience_ns = NET_NS
         return step
 
-    def look(self, now: int) -> Step:
+    def advice(self, now: int) -> Step:
         """Return what other threads are to do, after all events up to now."""
         step = self._step
         step.work = step.overtaken = None
@@ -882,9 +882,9 @@ class Engine:
         return {} if self.path_watch is None else self.path_watch.result(
             min(now, self._ended), self._state.scalars[JUDGE_FROM])
 
-    def stopped(self, begin: int, end: int) -> None:
+    def machine_stopped(self, begin: int, end: int) -> None:
         """Note that the machine stood still; with equal times: that it has not so far."""
-        self.verdicts.stopped(begin, end)
+        self.verdicts.machine_stopped(begin, end)
 
     def judge_overdue(self, now: int) -> None:
         """Report the sinks whose deadlines are over and which have not completed."""

@@ -126,7 +126,7 @@ class Entity(ChannelSource):
         self.collect_more: Callable_[[], None] | None = None
         # whether the pool lets a thread wait for its messages or requests (``is_eager``)
         self.counts_as_eager = False
-        # runs a step in its callback group, if that must be asked (``work.step_in_group``)
+        # runs a step in its callback group, if that must be asked (``work.run_in_group``)
         self.gate: Callable_[..., Any] | None = None
         # its mutually exclusive callback group, which is told of each execution
         self.exclusive: Any = None

@@ -613,7 +613,7 @@ class MultiDeadlineExecutor(BareExecutor):
             thread.start()
         except BaseException:  # too many threads
             self._pool.pause()
-            self._pool.resume_stepping()
+            self._pool.resume_spin_once()
             raise
         try:
             yield
@@ -622,7 +622,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._at_once.ring()
             thread.join()
             self._pool.pause()
-            self._pool.resume_stepping()
+            self._pool.resume_spin_once()
 
     # --- one callback at a time ------------------------------------------------------------------
 
@@ -657,7 +657,7 @@ class MultiDeadlineExecutor(BareExecutor):
         if not self._spinning.acquire(blocking=False):
             raise RuntimeError('Executor is already spinning')
         try:
-            with self._pool.stepping(), self._signals.watch():
+            with self._pool.in_spin_once(), self._signals.watch():
                 while not self.is_ending():
                     self._check_context()
                     self._raise_error()
@@ -686,18 +686,18 @@ class MultiDeadlineExecutor(BareExecutor):
             return True
         if done():  # the event that woke it has just been handled
             return False
-        wait_readable(self._stepping_epoll().fileno(), self._patience_s(
+        wait_readable(self._spin_once_epoll().fileno(), self._patience_s(
             deadline, self._upkeep.rest_s()))
         return self._handle_once()
 
-    def _stepping_epoll(self) -> select.epoll:
+    def _spin_once_epoll(self) -> select.epoll:
         """Return the epoll in which a spin in the calling thread waits."""
-        stepping: select.epoll | None = self._ending.stepping
-        if stepping is None:
-            stepping = self._ending.stepping = select.epoll()
-            stepping.register(self._pool.loop.fd, select.EPOLLIN)
-            stepping.register(self._at_once.loop.fd, select.EPOLLIN)
-        return stepping
+        epoll: select.epoll | None = self._ending.spin_once_epoll
+        if epoll is None:
+            epoll = self._ending.spin_once_epoll = select.epoll()
+            epoll.register(self._pool.loop.fd, select.EPOLLIN)
+            epoll.register(self._at_once.loop.fd, select.EPOLLIN)
+        return epoll
 
     def _handle_once(self) -> bool:
         """Handle ready events; run one callback if there is one, and return whether one ran."""
@@ -723,7 +723,7 @@ class MultiDeadlineExecutor(BareExecutor):
             raise RuntimeError('Executor is already spinning')
         loop = asyncio.get_running_loop()
         try:
-            with self._pool.stepping(), self._signals.watch():
+            with self._pool.in_spin_once(), self._signals.watch():
                 while not self.is_ending() and not self._was_ended():
                     with InterruptsDeferred():
                         self._raise_error()
@@ -744,7 +744,7 @@ class MultiDeadlineExecutor(BareExecutor):
     async def _readable(self, loop: AbstractEventLoop) -> None:
         """Let the event loop run until there is an arrival or a due time."""
         from mddag_executor.executor.asyncio_loop import set_done  # with asyncio
-        fd, event = self._stepping_epoll().fileno(), loop.create_future()
+        fd, event = self._spin_once_epoll().fileno(), loop.create_future()
         loop.add_reader(fd, set_done, event)
         left = self._patience_s(None, self._upkeep.rest_s())
         timer = None if left is None else loop.call_later(left, set_done, event)

@@ -11,7 +11,7 @@ import weakref
 
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.work import decides_itself, step_in_group, Work
+from mddag_executor.executor.work import decides_itself, run_in_group, Work
 from rclpy.callback_groups import ReentrantCallbackGroup
 
 
@@ -37,7 +37,7 @@ class CallbackGroups:
         decides = group is not None and decides_itself(group)
         entity.group = self._number(rclpy_object if decides else group)
         if decides:
-            entity.gate = partial(step_in_group, group, rclpy_object, self._passed)
+            entity.gate = partial(run_in_group, group, rclpy_object, self._passed)
         elif group is not None and entity.group >= 0 and group.has_entity(rclpy_object):
             entity.exclusive = group
 

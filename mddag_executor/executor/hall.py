@@ -24,7 +24,7 @@ from mddag_executor.executor.work import Work
 class Announced(Protocol):
     """Messages of other processes, whose jobs are announced."""
 
-    def take(self, work: Work, info: dict[str, Any], now: int) -> None:
+    def receive(self, work: Work, info: dict[str, Any], now: int) -> None:
         """Handle a message that may be of another process."""
 
 

@@ -134,7 +134,7 @@ class Lending:
             is_first = engine.rejoin(work, now)
             self.rejoining[work] = me
             # what waits already is chosen by another thread, as this one cannot run it
-            step = engine.step(me.worker, now) if is_first else engine.look(now)
+            step = engine.step(me.worker, now) if is_first else engine.advice(now)
             if step.work is not None:
                 self.hand_over(step)
             if pool.polling:

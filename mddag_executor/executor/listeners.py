@@ -132,7 +132,7 @@ def announce(fd: int, count: int = 1) -> None:
     _eventfd_write(fd, count)
 
 
-def take_count(fd: int) -> int:
+def read_count(fd: int) -> int:
     """Return the count of an eventfd, and set it to 0; 0 also if it is closed."""
     count = ctypes.c_uint64()
     return count.value if _eventfd_read(fd, ctypes.byref(count)) == 0 else 0

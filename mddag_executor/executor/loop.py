@@ -30,7 +30,7 @@ from mddag_executor.executor.listeners import (
     change_events,
     new_eventfd,
     Poll,
-    take_count,
+    read_count,
     TimerFd,
 )
 
@@ -191,7 +191,7 @@ class EventLoop:
         """End ``wake_all``: threads may wait again, unless the loop was closed meanwhile."""
         if self._leave >= 0:
             self._epoll.unregister(self._leave)
-            take_count(self._leave)
+            read_count(self._leave)
 
     def close(self) -> None:
         """

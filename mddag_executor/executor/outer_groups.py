@@ -96,7 +96,7 @@ class OuterGroup:
     def take_wait_ns(self) -> int:
         """Return how long callbacks have waited for others of the group since the last call."""
         with self._pool.lock:
-            return self._pool.engine.outer.take_wait(self.number)
+            return self._pool.engine.outer.read_wait(self.number)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
         """Run a function or coroutine as one of the group."""

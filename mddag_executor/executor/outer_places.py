@@ -54,7 +54,7 @@ class OuterPlaces:
         """Return whether executions of it may start, and will still when one has started."""
         return self._state.outer_limit[outer] > 0 and not self._state.outer_once[outer]
 
-    def take_wait(self, outer: int) -> int:
+    def read_wait(self, outer: int) -> int:
         """Return how long (ns) executions have waited for others of it since the last call."""
         waited = self._state.outer_wait[outer]
         self._state.outer_wait[outer] = 0

@@ -117,14 +117,14 @@ class Pauses:
 
 class Pause:
     """
-    One pause of a thread; all methods but ``wait_for_it`` and ``take`` need the engine's lock.
+    One pause of a thread; all but ``wait_for_it`` and ``pause_here`` need the engine's lock.
 
     :param thread: the ``WorkerThread`` that pauses.
     :ivar is_watching: whether the thread checks that while it pauses, or as soon as it does.
     :ivar since: when it was asked to pause (monotonic ns).
     """
 
-    __slots__ = ('_thread', 'ident', '_may_go_on', '_has_begun', '_codes', '_is_taken',
+    __slots__ = ('_thread', 'ident', '_may_go_on', '_has_begun', '_codes', '_is_reached',
                  'is_watching', 'since')
 
     def __init__(self, thread: Any) -> None:
@@ -134,7 +134,7 @@ class Pause:
         self._may_go_on.acquire()
         self._has_begun = threading.Lock()
         self._has_begun.acquire()
-        self._is_taken = False
+        self._is_reached = False
         self.since = monotonic_ns()
         self._codes = [*_own_code(sys._current_frames().get(self.ident))]
         self.is_watching = bool(self._codes)
@@ -146,11 +146,11 @@ class Pause:
         if self._codes:
             self._has_begun.acquire(timeout=PAUSES_BY_S)
 
-    def take(self) -> None:
+    def pause_here(self) -> None:
         """Pause; called by the thread itself."""
-        if self._is_taken or self._thread.pool.is_inside():  # in a finalizer of the user's
+        if self._is_reached or self._thread.pool.is_inside():  # in a finalizer of the user's
             return
-        self._is_taken = True
+        self._is_reached = True
         _monitor.end(self, self._codes)
         measurement = self._thread.measurement
         if measurement is not None:
@@ -215,7 +215,7 @@ class _Monitor:
     def _at_event(self, *_: Any) -> None:
         pause = self._pauses.get(threading.get_ident())
         if pause is not None:
-            pause.take()
+            pause.pause_here()
 
     def begin(self, pause: Pause, codes: list[CodeType]) -> None:
         """Let a thread pause in some code."""

@@ -30,7 +30,7 @@ class RunRecords:
         self._tables = tables
         self._state = state
 
-    def take(
+    def message_taken(
         self, entity: Entity, message: Any, source_timestamp: int, number: int | None, now: int
     ) -> None:
         """
@@ -42,7 +42,7 @@ class RunRecords:
             'rmw_take', now, get_native_id(), id(entity.rclpy_object), id(message),
             source_timestamp, True, number or 0)
 
-    def lost(self, entity: Entity, count: int, now: int) -> None:
+    def messages_lost(self, entity: Entity, count: int, now: int) -> None:
         """Record that the middleware dropped messages."""
         self._record('messages_lost', now, get_native_id(), entity.address, count)
 

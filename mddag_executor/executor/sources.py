@@ -27,7 +27,7 @@ from mddag_executor.executor.attribution import Publication, stamped_release
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.gaps import Gaps
 from mddag_executor.executor.kinds import ListenerEntity, Rooms
-from mddag_executor.executor.listeners import MANY, set_listener, take_count
+from mddag_executor.executor.listeners import MANY, read_count, set_listener
 from mddag_executor.executor.work import Work
 from msg_graph.binding import Entity as Declarable
 from rclpy.qos import HistoryPolicy
@@ -60,7 +60,7 @@ class ArrivalEntity(ListenerEntity):
         take = self._take
         try:
             if not left:
-                left = take_count(self.fd) if self.is_counted else MANY
+                left = read_count(self.fd) if self.is_counted else MANY
                 if not left:
                     return  # another thread has collected it
             if self.removed:
@@ -164,7 +164,7 @@ class SubscriptionEntity(ArrivalEntity):
         if number == gaps.expected:
             gaps.expected += 1
         elif missing := gaps.missing(number):
-            pool.engine.never_taken(self, missing, pool.now)
+            pool.engine.messages_lost(self, missing, pool.now)
         work = Work(self, self.rclpy_object.callback, taken if self._with_info else (taken[0],))
         if self._is_plain:
             pool.engine.ready(work, pool.now)
@@ -187,13 +187,13 @@ class SubscriptionEntity(ArrivalEntity):
         if engine.record is not None or self.source >= 0 or self.remote_publishers:
             now = pool.tick()  # the message may have been sent after the turn began
         if engine.record is not None:
-            engine.taken(
+            engine.message_taken(
                 self, message, stamp, info.get('publication_sequence_number'), now)
         if self.callback is None:
             engine.ready(work, now)
             return
         if self.awaits and publication is None and pool.announcements is not None:
-            pool.announcements.take(work, info, now)
+            pool.announcements.receive(work, info, now)
             return
         origin = None
         release = header = -1
@@ -216,7 +216,7 @@ class SubscriptionEntity(ArrivalEntity):
 
         :return: whether there was any arrival.
         """
-        announced = take_count(self.fd)
+        announced = read_count(self.fd)
         if not announced:
             return False  # nothing was announced, or it was just removed
         if announced > 1 or self.most_waiting:

@@ -200,7 +200,7 @@ class WorkerThread:
                     not group.beginning_execution(entity.rclpy_object)):
                 raise Refused
             self.outcome = (
-                work.step(must_check) if gate is None else gate(work, must_check))
+                work.run(must_check) if gate is None else gate(work, must_check))
         except Refused as error:
             self.outcome = error
             return

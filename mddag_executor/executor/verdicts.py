@@ -153,7 +153,7 @@ class Verdicts:
         if self.record is not None:
             self.record('job_release', now, threading.get_native_id(), dag, job, release)
 
-    def stopped(self, begin: int, end: int) -> None:
+    def machine_stopped(self, begin: int, end: int) -> None:
         """Note a time in which no thread of the process ran, which has just ended."""
         for dag in self.stops.stopped(begin, end) if end - begin >= LEAST_NS else ():
             self.in_stops[dag] += 1

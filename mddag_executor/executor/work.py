@@ -125,7 +125,7 @@ class Work:
         self.then = then
 
     @interruptible
-    def step(self, must_check: bool = True) -> Any:
+    def run(self, must_check: bool = True) -> Any:
         """
         Run, or continue; return None when it has finished, else what it waits for.
 
@@ -176,7 +176,7 @@ class TaskWork(Work):
     """An execution of an rclpy ``Task``; exceptions are the task's."""
 
     @interruptible
-    def step(self, must_check: bool = True) -> Any:
+    def run(self, must_check: bool = True) -> Any:
         """Run the task once; return None when it is done."""
         task: Any = self.function
         try:
@@ -211,11 +211,11 @@ def decides_itself(group: Any) -> bool:
         for kind in (MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup))
 
 
-def step_in_group(
+def run_in_group(
     group: Any, entity: Any, passed: Callable[[Work], None], work: Work, must_check: bool = True
 ) -> Any:
     """
-    Run a step of an execution as ``Work.step`` does, or raise Refused.
+    Run a step of an execution as ``Work.run`` does, or raise Refused.
 
     :param group: the user-defined callback group of rclpy's entity.
     :param passed: called before an execution runs.
@@ -226,7 +226,7 @@ def step_in_group(
         passed(work)
     waits_for = None
     try:
-        waits_for = work.step(must_check)
+        waits_for = work.run(must_check)
     finally:
         if waits_for is None:
             group.ending_execution(entity)

@@ -153,9 +153,9 @@ class WorkerPool:
         self._leaving = False
         self._all_left = threading.Event()
         #: whether the thread of a ``spin_once`` runs everything
-        self.is_stepping = False
+        self.is_spin_once = False
         # coroutines that have yielded: they continue in the next step
-        self._of_next_step: list[Work] = []
+        self._of_next_turn: list[Work] = []
         self._loops: Loops | None = None
         self.now = 0
         self.due = DueTimes(self)
@@ -250,7 +250,7 @@ class WorkerPool:
         if running is not None and running.pool is self and running.is_short():
             self.due.arm_by(self.now - self.offset + self.engine.patience())
         else:
-            self.wake_for(self.engine.look(self.now), self.now)
+            self.wake_for(self.engine.advice(self.now), self.now)
 
     def wake_for(self, step: Step, now: int) -> None:
         """Wake a thread if it may start an execution, or check what that has to wait for."""
@@ -261,7 +261,7 @@ class WorkerPool:
 
     def call(self) -> None:
         """Wake a thread, which starts what may start, or waits for events."""
-        if self.polling or self.is_stepping:
+        if self.polling or self.is_spin_once:
             if not self._bell_rings:
                 self._bell_rings = True
                 self.loop.wake()
@@ -288,15 +288,15 @@ class WorkerPool:
 
     def start(self) -> None:
         """Let executions start; the first call makes the threads."""
-        self._resume_of_last_step()
+        self._resume_of_last_turn()
         with self.lock:
             if self._closed:
                 return
             self.running = True
-            self.is_stepping = False
+            self.is_spin_once = False
             self.stopped_at = 0
             self.due.begin(self.tick() - self.offset)
-            self.engine.stopped(self.now, self.now)  # stops are noticed from now on
+            self.engine.machine_stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:
                 self._new_thread()
             # one that did not leave after the last spin (``pause``) is asleep, and not parked
@@ -419,7 +419,7 @@ class WorkerPool:
         except Exception as error:
             self.fail(error)
         try:
-            self._work(me)
+            self._take_turns(me)
         except BaseException as error:
             self.fail(error)
         finally:
@@ -432,7 +432,7 @@ class WorkerPool:
             if is_last:
                 self._all_have_ended()
 
-    def _work(self, me: WorkerThread) -> None:
+    def _take_turns(self, me: WorkerThread) -> None:
         """Take turns until the pool is closed."""
         wait, park, receive, go_on, execute = (
             self.loop.wait, self.parking.wait, self._receive, self._go_on, me.execute)
@@ -612,13 +612,13 @@ class WorkerPool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         engine, due, rejoining = self.engine, self.due, self.lending.rejoining
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
-        if self.running and not (self.is_stepping and me.thread is not None):
+        if self.running and not (self.is_spin_once and me.thread is not None):
             step = engine.step(me.worker, now, self.polling > 0)
             while rejoining and step.work in rejoining:
                 self.lending.hand_over(step)
                 step = engine.step(me.worker, now, self.polling > 0)
         else:
-            step = engine.look(now)
+            step = engine.advice(now)
         work = step.work
         if work is None:
             if step.deadline != due.overdue.deadline:
@@ -627,7 +627,7 @@ class WorkerPool:
                 self._note_misses()
             if me.thread is not None:  # else a visitor: the thread of a spin_once
                 self._rest(me, step)
-                if self.is_stepping and step.more:
+                if self.is_spin_once and step.more:
                     self.call()
             due.rest(now - self.offset)
             return False
@@ -637,10 +637,10 @@ class WorkerPool:
             self.become(me, _RUNNING)
         if step.overtaken is not None:
             self.pauses.begin(step.overtaken, me)
-        if step.is_short and not self.polling and not self.is_stepping:  # nearly always
+        if step.is_short and not self.polling and not self.is_spin_once:  # nearly always
             me.is_spare = False
             if step.n_idle:
-                due.look_after(now - self.offset, step.patience_ns)
+                due.arm_late_look(now - self.offset, step.patience_ns)
         else:
             self._share_events(me, step, now)
         return True
@@ -651,7 +651,7 @@ class WorkerPool:
         me.is_spare = not (step.is_short or step.holder is step.work)
         if step.deadline != due.overdue.deadline and (self.polling or not step.is_short):
             due.overdue.set(step.deadline)  # else there is time until it ends
-        if self.is_stepping:
+        if self.is_spin_once:
             due.arm(now - self.offset)
         elif self.polling:
             if step.more:
@@ -662,13 +662,13 @@ class WorkerPool:
             if me.is_spare or self._eager or step.more:
                 self.call()
             else:
-                due.look(now - self.offset)
+                due.arm_look(now - self.offset)
 
     def _rest(self, me: WorkerThread, step: Step) -> None:
         """Let a thread without an execution wait for events, or park it."""
         others = self.polling - (me.state is _WAITING)
         # while a callback computes, its thread handles the events when it ends
-        waits = self.running and not self.is_stepping and not self._closed and (
+        waits = self.running and not self.is_spin_once and not self._closed and (
             self._eager > 0 or step.holder is None) and (
             others == 0 or me.is_spare and others < step.n_idle)
         self.become(me, _WAITING if waits else _PARKED)
@@ -726,8 +726,8 @@ class WorkerPool:
             work.coroutine.suspended(resume, awaited)
             return
         work.coroutine.suspended(resume)
-        if self.is_stepping:
-            self._of_next_step.append(work)
+        if self.is_spin_once:
+            self._of_next_turn.append(work)
             return
         work.yields += 1
         rest = min(work.yields * 1_000, MOST_YIELD_NS)
@@ -736,20 +736,20 @@ class WorkerPool:
     # --- spin_once -------------------------------------------------------------------------------
 
     @contextmanager
-    def stepping(self) -> Iterator[None]:
+    def in_spin_once(self) -> Iterator[None]:
         """Let the calling thread run executions one by one (``run_one``) while entered."""
-        self.resume_stepping()
+        self.resume_spin_once()
         try:
             yield
         finally:
             with self.lock:
-                self.running = self.is_stepping = False
+                self.running = self.is_spin_once = False
                 self.lending.let_go_on()
 
-    def resume_stepping(self) -> None:
-        """Continue as in ``stepping``, after ``start`` and ``pause``."""
+    def resume_spin_once(self) -> None:
+        """Continue as in ``in_spin_once``, after ``start`` and ``pause``."""
         with self.lock:
-            self.running = self.is_stepping = True
+            self.running = self.is_spin_once = True
             self.stopped_at = 0
             self.due.begin(self.tick() - self.offset)
 
@@ -757,7 +757,7 @@ class WorkerPool:
         """Collect arrivals, and run one execution in the calling thread, if there is one."""
         me = WorkerThread(self, None)
         me.begin()
-        self._resume_of_last_step()
+        self._resume_of_last_turn()
         with self.lock:
             self._visitors.append(me)
         before, current.running = current.running, me
@@ -776,8 +776,8 @@ class WorkerPool:
             with self.lock:
                 self._visitors.remove(me)
 
-    def _resume_of_last_step(self) -> None:
-        several, self._of_next_step = self._of_next_step, []
+    def _resume_of_last_turn(self) -> None:
+        several, self._of_next_turn = self._of_next_turn, []
         for work in several:
             self.resume(work)
 

@@ -293,7 +293,7 @@ class Loop:
         entity = work.entity
         self._current = execution
         try:
-            execution.waits_for = work.step() if entity.gate is None else entity.gate(work)
+            execution.waits_for = work.run() if entity.gate is None else entity.gate(work)
         except Destroyed:
             self.engine.destroyed(work, self.now)
             return False

@@ -324,7 +324,7 @@ class Messages:
             if stamp < 0:
                 stamp = now  # a job of its own
         if engine.record is not None:
-            engine.taken(entity, message, source_stamp, number, now)
+            engine.message_taken(entity, message, source_stamp, number, now)
         work = Work(entity, entity.rclpy_object.callback, args)
         engine.arrived(work, origin, release, stamp, now)
 

@@ -432,8 +432,8 @@ def test_a_step_says_what_other_threads_are_to_do():
         engine.ready(Work(entity, print), 0)
     step = engine.step(2, 0, others_wait=False)     # its thread will be free in time
     assert step.is_short and not step.more and step.n_idle == 0
-    assert step.patience_ns == 4 * MS < engine.look(0).patience_ns * 2
-    assert not engine.look(0).more and engine.look(0).work is None
+    assert step.patience_ns == 4 * MS < engine.advice(0).patience_ns * 2
+    assert not engine.advice(0).more and engine.advice(0).work is None
 
 
 def test_a_step_says_what_is_overtaken_and_when_the_next_deadline_is():
@@ -473,7 +473,7 @@ def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
         elif step in running:
             engine.finished(running.pop(step), now, now, now, 0, step)
             begun.append(engine.step(step, now).work)
-        while begun and engine.look(now).more and (len(begun) == 1 or begun[-1] is not None):
+        while begun and engine.advice(now).more and (len(begun) == 1 or begun[-1] is not None):
             begun.append(engine.step(0, now).work)
         running |= {work.worker: work for work in begun if work is not None}
         check(engine)
@@ -630,7 +630,7 @@ class Steps:
         engine = self.engine
         return (
             started and (started.args, started.worker), engine.queue_length, engine.has_waiting,
-            engine.idle_workers, engine.look(now).more,
+            engine.idle_workers, engine.advice(now).more,
             [(len(each.waiting), each.ran, each.dropped, each.skipped, each.failed)
              for each in self.entities])
 

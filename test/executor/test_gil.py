@@ -322,7 +322,7 @@ class PausedHere:
 def test_an_interrupted_pause_ends():
     thread = PausedHere(is_inside=False)
     with pytest.raises(KeyboardInterrupt):
-        pausing.Pause(thread).take()
+        pausing.Pause(thread).pause_here()
     assert thread.calls == ['pause', 'resume'] and thread.paused_ns > 0
 
 
@@ -331,7 +331,7 @@ def test_a_thread_that_owns_the_lock_of_the_engine_does_not_pause():
     """The finalizers of a user's objects may run there."""
     thread = PausedHere(is_inside=True)
     pause = pausing.Pause(thread)
-    pause.take()
+    pause.pause_here()
     pause.end()
     assert thread.calls == []
 

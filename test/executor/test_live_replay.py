@@ -152,9 +152,10 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
     # some reported as overdue may have ended in time: their threads could not say so before
     assert 20 < missed <= len(reported) <= missed + sum(miss.kind == 'overdue' for miss in misses)
     dags = open_recording(path).task_set.dags
-    assert reported == sorted(
-        (dags[event['dag']].vertices[event['vertex']].name, event['job'])
-        for event in read_events(path) if event['_name'] == 'mddag:deadline')
+    recorded = {(dags[event['dag']].vertices[event['vertex']].name, event['job'])
+                for event in read_events(path) if event['_name'] == 'mddag:deadline'}
+    certain = {(miss.vertex, miss.job) for miss in misses if miss.kind != 'overdue'}
+    assert certain <= recorded <= {*reported} and len(recorded) == missed
 
     # something happened in each of the ways that there are
     sinks = {name: sink for dag in live['dags'].values() for name, sink in dag['sinks'].items()}

@@ -90,8 +90,8 @@ with self._pool.lock:
 CASES = [
     # those that take longest first
     Case('every_twentieth_lost', [(
-        'executor/work.py', 'def step(self, must_check: bool = True) -> Any:', """\
-def step(self, must_check: bool = True) -> Any:
+        'executor/work.py', 'def run(self, must_check: bool = True) -> Any:', """\
+def run(self, must_check: bool = True) -> Any:
         if self.coroutine is None and self.entity.ran % 20 == 19:
             return None""")], of(
         'test_executor.py', 'test_each_time_that_a_timer_is_due_counts', *(
@@ -110,7 +110,7 @@ may not check
         'executor/workers.py', 'self._closed = True', 'return True')], of(
         'test_spin.py', 'test_no_thread_goes_on_though_the_context_does')),
     Case('unknown_waits_not_resumed', [
-        ('executor/workers.py', 'self._of_next_step.append(work)', 'pass'),
+        ('executor/workers.py', 'self._of_next_turn.append(work)', 'pass'),
         ('executor/workers.py',
          'self.call_at(monotonic_ns() + rest, resume)', 'pass')], of(
         'test_tasks.py',
@@ -195,7 +195,7 @@ client.completed = getattr(client, 'completed', 0) + 1
         'executor/workers.py', 'self._eager > 0 or step.holder is None', 'True')], of(
         'test_gil.py', 'test_no_thread_waits_for_events_while_a_callback_computes[elsewhere]')),
     Case('overtaken_callbacks_do_not_pause', [(
-        'executor/pausing.py', 'pause.take()', 'pass')], of(
+        'executor/pausing.py', 'pause.pause_here()', 'pass')], of(
         'test_gil.py', 'test_a_callback_pauses_while_a_more_urgent_one_computes[here]')),
     Case('paused_callbacks_wait_for_ever', [(
         'executor/pausing.py', 'pauses.overtaker_waits(work)', 'pass')], of(
