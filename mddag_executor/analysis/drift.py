@@ -69,12 +69,17 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         # once, if only in the warm-up
         ran[key] += late_counts.get(callback, 0) or min(1, counts.get(callback, 0))
         got[key] += late_got.get(callback, 0)
+    whole = (recording.whole or recording).releases['dag']
+    for dag in judge.dags:      # what fires once may have fired before the part that is judged
+        source = dag.vertices[dag.source].callback
+        if source.once and (whole == dag.index).any():
+            ran[source.key] = max(1, ran[source.key])
     came: defaultdict[str, Set[str]] = defaultdict(set)
     for each in names.made:
         if counts.get(each.number) and each.number in keys:
             came[keys[each.number]] |= {each.start}
-    whole = table['vertex'][declared & (table['completes'] == VERTEX)]
-    for vertex in distinct(whole).tolist():
+    completed = table['vertex'][declared & (table['completes'] == VERTEX)]
+    for vertex in distinct(completed).tolist():
         came.pop(vertices[vertex].callback.key, None)   # it got all of them
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
     sent = recording.publications
@@ -93,4 +98,4 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         max(0, recording.end - recording.run.begin), releases,
         dict(got), dict(ran), came, publishes, set(names.nodes) or None,
         [each.entity for each in names.made
-         if each.entity is not None and each.number not in bound], periods))
+         if each.entity is not None and each.number not in bound], periods, recording.end))

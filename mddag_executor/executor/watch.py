@@ -27,12 +27,18 @@ class Watch:
         self._task_set = task_set
         self._now = executor._trace_clock.now
         self._begin = self._now()
+        self._end: int | None = None
         self._releases = [Releases() for _ in task_set.dags]
         executor._engine.verdicts.on_release = self._released
 
     def _released(self, dag: int, release: int) -> None:
         if dag < len(self._releases):
             self._releases[dag].add(release)
+
+    def stop(self) -> None:
+        """Watch no longer: the run has ended."""
+        if self._end is None:
+            self._end = self._now()
 
     def drift(self, statistics: Statistics) -> list[Drift]:
         """Return the differences between run and declaration; ``statistics`` are its counts."""
@@ -41,10 +47,10 @@ class Watch:
     def observed(self, statistics: Statistics) -> Observed:
         """Return the observations; ``statistics`` are the run's counts."""
         first = min((r.first for r in self._releases if r.count), default=self._begin)
-        counts = statistics['callbacks']
+        counts, end = statistics['callbacks'], self._now() if self._end is None else self._end
         sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
         return Observed(
-            duration_ns=max(0, self._now() - first),
+            duration_ns=max(0, end - first), end_ns=end,
             releases=dict(zip(sources, self._releases)),
             got={key: count['ready'] for key, count in counts.items()},
             ran={key: count['ran'] for key, count in counts.items()},

@@ -379,5 +379,6 @@ def _observed(task_set: TaskSet, results: Results) -> Observed:
             releases[source.key] = Releases(**home['releases'][source.key])
     return Observed(
         duration_ns=max((part['duration_ns'] for part in parts.values()), default=0),
+        end_ns=max((part['end_ns'] for part in parts.values()), default=0),
         releases=releases, got=got, ran=ran, came=came, publishes={**publishes},
         undeclared=[Entity(*each) for part in parts.values() for each in part['undeclared']])

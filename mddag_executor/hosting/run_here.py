@@ -179,6 +179,7 @@ class _Run:
         self._display.warn(line)
 
     def _end_begins(self) -> None:
+        self._watch.stop()
         # a native thread writes the stacks, even if the thread that holds the GIL is stuck
         faulthandler.dump_traceback_later(STUCK_S, file=2)
         if self._part is not None:

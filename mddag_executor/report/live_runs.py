@@ -113,9 +113,13 @@ def _never_ran(result: dict[str, Any], reported: Collection[str]) -> Iterator[st
              for key, question in not_found.items()])
     never = [key for key in result['never_ran']
              if key not in reported and key not in result['not_found']]
-    if never:
-        yield (f'{counted(len(never), "declared callback")} never ran, as nothing started '
-               f'{"it" if len(never) == 1 else "them"}: ' + listed(never))
+    waited = {key: dropped for key in never if (dropped := result['dropped'].get(key))}
+    for some, why in ((waited, 'all that was ready was dropped'), (
+            [key for key in never if key not in waited], 'nothing started')):
+        if some:
+            yield (f'{counted(len(some), "declared callback")} never ran, as {why}'
+                   f'{"" if some is waited else " it" if len(some) == 1 else " them"}: '
+                   + listed([*some]))
 
 
 def _absent(dags: dict[str, Any]) -> Iterator[str]:

@@ -299,7 +299,7 @@ class DriftResult(TypedDict):
     """A difference between a run and its declaration."""
 
     kind: str
-    """`publishes`, `rate` or `never ran`."""
+    """`publishes`, `rate`, `stopped` or `never ran`."""
     callback: str
     """The callback that it is about."""
     topic: str | None
@@ -307,7 +307,7 @@ class DriftResult(TypedDict):
     declared: int | None
     """The declared value, a period in ns or a number of messages; null if there is none."""
     observed: int | None
-    """The observed value; null if there is none."""
+    """The observed value, of `stopped` the time since the last release in ns; null if there is none."""
     text: str
     """The difference in words."""
 

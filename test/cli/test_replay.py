@@ -79,3 +79,13 @@ def test_a_run_in_which_nothing_was_due_is_not_judged(tmp_path, call):
         assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith(
             f'error: {trace}: no job was due at any sink, so no deadline was judged: '), done
     assert call('replay', trace, '--fail-on-miss').returncode == 1
+
+
+def test_a_timer_that_fired_once_before_the_judged_part_is_no_difference(call, folder):
+    Path('g.yaml').write_text('mddag: 1\nnodes:\n' + ''.join(
+        f'  - {{node: /{name}, callbacks: [{{name: t, timer: 10ms, {more}deadline: 10ms, '
+        'execution_time: 1ms}]}\n'
+        for name, more in (('up', 'once: true, '), ('works', ''))))
+    assert call('simulate', 'g.yaml', '--duration', '1s', '--trace', 'r.mcap').returncode == 0
+    for part in ('0s',), ('500ms',), ('500ms', '--to', '800ms'):
+        assert call('replay', 'r.mcap', '--json', '-', '--from', *part).result['drift'] == []

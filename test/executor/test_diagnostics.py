@@ -270,6 +270,9 @@ def test_a_wrong_name_is_warned_of_once(
     never_started = {'never_ran': ['/detector:detect'], 'not_found': {}, 'measured': None}
     assert ('1 declared callback never ran, as nothing started it: /detector:detect'
             in live_lines({**executor.statistics(), **never_started}))
+    never_started['dropped'] = {'/detector:detect': 7}
+    assert ('1 declared callback never ran, as all that was ready was dropped: /detector:detect'
+            in live_lines({**executor.statistics(), **never_started}))
 
 
 def test_timers_that_fire_once_need_not_exist_all_the_time(

@@ -113,6 +113,44 @@ def test_few_messages_and_short_runs_prove_nothing():
         assert [each.callback for each in found] == never_ran
 
 
+def test_a_source_that_stopped_is_named_although_its_results_were_in_time():
+    seen = observed()
+    seen.end_ns = 1_480 * MS
+    assert drift(TASKS, seen) == []
+    seen.end_ns = 1_500 * MS
+    assert [(each.kind, each.text) for each in drift(TASKS, seen)] == [
+        ('stopped', f'/a:{name} was not released any more in the last {silent} s, and every '
+         f'{period} is declared')
+        for name, silent, period in (('t', '1.010', '10ms'), ('y', '1.020', '20ms'))]
+    rare = loads(TASKS.text.replace('period: 20ms', 'period: 20ms, sporadic: true').replace(
+        'timer: 10ms', 'timer: 10ms, once: true'))
+    assert [each.kind for each in drift(rare, seen)] == []
+
+
+def test_of_publishers_only_those_that_always_publish_are_expected_to():
+    tasks = loads("""\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: always, timer: 100ms, publishes: [/d], dag: always}
+      - {name: sometimes, timer: 10ms, may_publish: [/d], dag: sometimes}
+  - node: /b
+    callbacks: [{name: keep, subscription: /d, deadline: none}]
+""")
+    ran = {'/a:always': 20, '/a:sometimes': 200}
+
+    def texts(got):
+        return [each.text for each in drift(tasks, Observed(
+            duration_ns=2_000 * MS, got={'/b:keep': got}, ran={**ran, '/b:keep': got}))]
+
+    assert texts(21) == texts(120) == texts(220) == []
+    assert texts(5) == [
+        '/b:keep got 5 messages, and by the declaration 20 were due: if /a:always published /d in '
+        "5 of 20 runs, declare 'may_publish: [/d]'"]
+    assert texts(400) == ['/b:keep got 400 messages, and by the declaration 220 were due']
+
+
 def test_a_sync_publishes_once_for_all_messages_of_a_job():
     """Two publishers of one topic make three legs of two topics."""
     task_set = graph("""
