@@ -220,8 +220,8 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
             observed.end_ns - releases.last > max(SILENCE_NS, LEAST * period)):
         silent = observed.end_ns - releases.last
         return Drift('stopped', callback.key, None, period, silent, printable(
-            f'{callback.key} was not released any more in the last {silent / 1e9:.3f} s, and every '
-            f'{format_duration(period)} is declared'))
+            f'{callback.key} was not released any more in the last {silent / 1e9:.3f} s, and '
+            f'every {format_duration(period)} is declared'))
     if releases.count < LEAST:
         return None
     mean = releases.mean_ns()

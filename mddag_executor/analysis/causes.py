@@ -116,12 +116,25 @@ _SPAN = np.dtype([
 _LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _OTHER_TOPIC, _PENDING = range(7)
 
 
+class Busy(NamedTuple):
+    """
+    What ran in a process.
+
+    :ivar full: when all workers were busy.
+    :ivar some: when any callback ran that may have held the GIL (a callback that lent its worker
+        does not); ``shared``: when several held it.
+    """
+
+    full: Spans
+    some: Spans
+    shared: Spans
+
+
 class Pool(NamedTuple):
     """
     What ran and what stalled during the misses.
 
-    :ivar full: when all workers were busy; ``some``: when any callback ran that may have held the
-        GIL (a callback that lent its worker does not); ``shared``: when several held it.
+    :ivar busy: by place what ran there; in a recording of another executor of all places together.
     :ivar stalls: begin and end of each stall.
     :ivar knows_workers: whether the number of workers is known, and an idle one starts what is
         ready.
@@ -133,15 +146,26 @@ class Pool(NamedTuple):
         of a driven sync.
     """
 
-    full: Spans
-    some: Spans
-    shared: Spans
+    busy: dict[int, Busy]
     stalls: list[tuple[int, int]]
     knows_workers: bool
     place_of: Ints
     place_of_vertex: Ints
     threads: dict[int, Spans] | None
     answers: Mask
+
+    def within(self, kind: str, spans: Table) -> Ints:
+        """
+        Return how much of each span a kind of ``Busy`` covers at its place, ns.
+
+        Nothing is known of a place at which nothing ran.
+        """
+        covered = np.zeros(len(spans), dtype=np.int64)
+        for place, busy in self.busy.items():
+            mine = np.flatnonzero(
+                spans['place'] == place) if self.threads is None else np.arange(len(spans))
+            covered[mine] = getattr(busy, kind).within(spans['begin'][mine], spans['end'][mine])
+        return covered
 
 
 class Usual(NamedTuple):
@@ -249,7 +273,7 @@ def find(
     lags = kinds == _LAG
     if pool.knows_workers:
         times[lags, WAITED] = np.minimum(
-            left[lags], pool.full.within(spans['begin'][lags], spans['end'][lags]))
+            left[lags], pool.within('full', spans[lags]))
         times[lags, RELEASED_LATE] -= times[lags, WAITED]
     runs = kinds == _RUN
     normal = usual.runs[spans['vertex']]
@@ -330,7 +354,7 @@ def _ran_long(spans: Table, more: Ints, usual: Usual, pool: Pool) -> Ints:
     idle = np.where(starved, more - computed, 0)
     times[:, RAN_LONG] = more - idle
     times[:, INTERPRETER] = np.minimum(
-        idle, pool.shared.within(spans['begin'], spans['end']))
+        idle, pool.within('shared', spans))
     times[:, MACHINE] = idle - times[:, INTERPRETER]
     return times
 
@@ -353,10 +377,11 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     if not pool.knows_workers:
         times[:, WAITED] = left
         return times
-    begins, ends = spans['begin'], spans['end']
-    times[:, WAITED] = np.minimum(left, pool.full.within(begins, ends))
+    # where nothing ran, it is not known whose workers were busy
+    times[:, WAITED] = np.where(np.isin(spans['place'], [*pool.busy]), np.minimum(
+        left, pool.within('full', spans)), left)
     left = left - times[:, WAITED]
-    some = pool.some.within(begins, ends) - times[:, WAITED] - times[:, GROUP]
+    some = pool.within('some', spans) - times[:, WAITED] - times[:, GROUP]
     times[:, INTERPRETER] = np.clip(some, 0, left)
     left = left - times[:, INTERPRETER]
     nothing = left >= _NOTHING_NS
@@ -389,7 +414,7 @@ def _pending(
         waits = ready < end <= start or never.why_dropped(key) == 'aborted'
         if not waits and key not in never.dropped and (
                 rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
-            full, = pool.full.within(*(np.array([each]) for each in (begin, end)))
+            full, = pool.within('full', spans[i:i + 1])
             waits = pool.knows_workers and 2 * int(full) >= end - begin
         if waits:
             spans['kind'][i], spans['more'][i] = _WAIT, min(group, end - begin)

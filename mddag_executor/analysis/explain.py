@@ -20,6 +20,7 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.analysis.causes import (
     behind,
+    Busy,
     CAUSES,
     delayed_by,
     find,
@@ -76,10 +77,10 @@ class Explanation:
         # without misses there is nothing to explain
         self._executions = recording.executions[:None if len(judged.missed) else 0]
         self._rows = ran(self._executions)
-        # with several processes it is unknown whose workers were busy
         run = recording.run
-        self._workers = run.head.workers if run.declared and run.processes == 1 and \
-            run.head.policy not in SIMULATED_ONLY else 0
+        # of each process
+        self._workers = 0 if run.imported or run.head.policy in SIMULATED_ONLY else (
+            run.head.workers if run.processes == 1 else run.workers_each)
         # where callbacks may delay each other: of another executor it is not known which threads
         # share its work
         self._place = self._executions['worker' if run.imported else 'process'].astype(
@@ -133,29 +134,38 @@ class Explanation:
     def _pool(self, missed: Table) -> Pool:
         """Return what ran and what stalled during the misses."""
         table, rows = self._executions, self._rows
-        on_workers = rows[table['worker'][rows] >= 0]
-        start, end = table['start'][on_workers], table['end'][on_workers]
-        # undeclared callbacks may also hold the GIL: a trace does not say
-        holding = rows[(table['holds_gil'][rows] & (table['completes'][rows] > 0))
-                       | (table['vertex'][rows] < 0)]
-        since, until = table['began'][holding], table['end'][holding]
         first = int(min(table['start'][rows].min(initial=_NO_END),
                         missed['release'].min(initial=_NO_END)))
         # by vertex the place of its last execution
-        one = not self._recording.run.imported and self._recording.run.processes == 1
+        imported = self._recording.run.imported
+        one = not imported and self._recording.run.processes == 1
         of_vertex = np.full(len(self._task_set.vertices) + 1, 0 if one else -1)
         of_vertex[table['vertex'][rows]] = self._place[rows]
         threads = {
             thread: Spans(*crowded(table['start'][each], table['end'][each], 1))
             for thread in distinct(self._place[rows]).tolist()
             for each in [rows[self._place[rows] == thread]]
-        } if self._recording.run.imported else None
+        } if imported else None
         return Pool(
-            Spans(*crowded(start, end, max(1, self._workers))),
-            Spans(*(crowded(since, until, 1) if len(holding) else crowded(start, end, 1))),
-            Spans(*crowded(since, until, 2)),
+            {-1: self._busy(rows)} if imported else {
+                place: self._busy(rows[self._place[rows] == place])
+                for place in {*([0] if one else ()), *distinct(self._place[rows]).tolist()}},
             [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
             self._place, of_vertex, threads, self._answers())
+
+    def _busy(self, rows: Ints) -> Busy:
+        """Return when executions occupied all workers, and when they may have held the GIL."""
+        table = self._executions
+        on_workers = rows[table['worker'][rows] >= 0]
+        start, end = table['start'][on_workers], table['end'][on_workers]
+        # callbacks that ran undeclared may also have held it: a trace does not say
+        holding = rows[(table['holds_gil'][rows] & (table['completes'][rows] > 0))
+                       | (table['vertex'][rows] < 0)] if self._recording.run.declared else rows
+        since, until = table['began'][holding], table['end'][holding]
+        return Busy(
+            Spans(*crowded(start, end, max(1, self._workers))),
+            Spans(*(crowded(since, until, 1) if len(holding) else crowded(start, end, 1))),
+            Spans(*crowded(since, until, 2)))
 
     def _answers(self) -> Mask:
         """Return which executions of driven syncs messages of other topics started."""

@@ -307,7 +307,9 @@ class DriftResult(TypedDict):
     declared: int | None
     """The declared value, a period in ns or a number of messages; null if there is none."""
     observed: int | None
-    """The observed value, of `stopped` the time since the last release in ns; null if there is none."""
+    """
+    The observed value, of `stopped` the time since the last release in ns; null if there is none.
+    """
     text: str
     """The difference in words."""
 
