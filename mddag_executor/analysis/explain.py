@@ -207,7 +207,8 @@ class Explanation:
         waited then, by the usual times of it and of those after it.  The executor estimates these
         times itself, so a demotion shortly before is not counted.
         """
-        importance = np.array([*self._tables.importance, 0])
+        # the last one is that of undeclared callbacks, to which nothing gives way
+        importance = np.array(self._tables.importance)
         found: Mask = (missed['demoted'] < _NO_END) & (
             importance[missed['sink']] < importance[:-1].max(initial=0))
         waits = links[found[links['of']]]

@@ -265,16 +265,20 @@ def test_a_callback_that_never_ran_has_the_cause_that_is_recorded(
     assert REMEDIES[cause] in text
 
 
-def test_lateness_is_told_from_importance(tmp_path):
+@pytest.mark.parametrize(('importance', 'second'), [
+    ('high', 'less important'), ('normal', 'demoted')])
+def test_lateness_is_told_from_importance(importance, second, tmp_path):
     # both sinks are demoted and start after 80 ms: the one when its deadline was out of reach,
-    # the other one at once, for the more important one
-    trace = Written(tmp_path / 'run.mcap', """\
+    # the other one at once, for the more important one, if there is one
+    trace = Written(tmp_path / 'run.mcap', f"""\
 mddag: 1
 workers: 1
 nodes:
-  - {node: /a, callbacks: [{name: main, dag: a, timer: 1s, deadline: 90ms, importance: high}]}
-  - {node: /b, callbacks: [{name: late, dag: b, timer: 1s, deadline: 20ms}]}
-  - {node: /c, callbacks: [{name: less, dag: c, timer: 1s, deadline: 20ms}]}
+  - node: /a
+    callbacks:
+      - {{name: main, dag: a, timer: 1s, deadline: 90ms, importance: {importance}}}
+  - {{node: /b, callbacks: [{{name: late, dag: b, timer: 1s, deadline: 20ms}}]}}
+  - {{node: /c, callbacks: [{{name: less, dag: c, timer: 1s, deadline: 20ms}}]}}
 """)
     for job in range(10):
         at = job * 1000
@@ -289,7 +293,7 @@ nodes:
         trace.run(2, 0, job, start + 5, start + 10, ready=at)
     result = explained(trace.end(10000))
     assert result['sinks'] == {name: {**dict.fromkeys(CAUSES, 0), cause: 5} for name, cause in (
-        ('/b:late', 'demoted'), ('/c:less', 'less important'))}
+        ('/b:late', 'demoted'), ('/c:less', second))}
     assert all(part['behind'][0]['callback'] == '/a:main' for job in result['jobs']
                for part in job['parts'] if part['cause'] in ('demoted', 'less important'))
 

@@ -67,6 +67,12 @@ class Trace:
                      took, True)
         self.job += 1
 
+    def runs_another(self, start, end):
+        """Run an undeclared callback; times in ns since the base."""
+        self.add('dispatch', start, ADDRESS + 1, -1, -1, -1, 1, BASE - self.late + start, 0)
+        self.add('callback_start', start, ADDRESS + 1, False)
+        self.add('callback_end', end, ADDRESS + 1)
+
     def knows(self, topic, handle):
         for kind in ('publisher', 'subscription'):
             self.add(f'rcl_{kind}_init', 0, handle, 1, handle, topic, 10)
@@ -120,6 +126,20 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late, boot):
     assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
 
 
+@pytest.mark.parametrize(('where', 'cause'), [('down', 'interpreter'), ('up', 'machine')])
+def test_a_callback_waits_for_what_runs_in_its_own_process(where, cause, tmp_path):
+    # it starts 6 ms after it is ready, and one of two workers runs another callback meanwhile
+    traces = {name: Trace(tmp_path, name, vertex) for vertex, name in enumerate(('up', 'down'))}
+    for job in range(3):
+        release = job * 20 * MS
+        traces['up'].runs(release, release + MS)
+        traces[where].runs_another(release + 3 * MS, release + 9 * MS)
+        traces['down'].runs(release, release + 9 * MS, ready=release + 3 * MS)
+    outcome = replay([trace.end(100 * MS) for trace in traces.values()])
+    assert {name: n for name, n in outcome.explanation.summary()['causes'].items() if n} == {
+        cause: 3}
+
+
 @pytest.mark.parametrize('apart', [20_000, 0])
 def test_the_messages_of_a_burst_keep_their_jobs(tmp_path, apart):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)
@@ -156,7 +176,8 @@ def test_drops_are_of_the_jobs_of_the_run(tmp_path, key, reason, verdict):
     missed, = outcome.judged.missed
     assert (missed['job'], missed['kind']) == (4, verdict)
     if reason == 'aborted':
-        assert outcome.explanation.worst()['parts'][-1]['cause'] == 'waited'
+        # it was ready, and nothing ran in its process
+        assert outcome.explanation.worst()['parts'][-1]['cause'] == 'machine'
 
 
 def two_machines(folder, late, back=True):

@@ -101,6 +101,17 @@ def undeclared(source, target):
     return text
 
 
+def test_with_an_idle_worker_a_callback_waits_for_the_interpreter(run):
+    # the trace does not say whether the other one held it, so it may have
+    for job in range(3):
+        at = 100 * job
+        run.runs(SCAN, at, at + 50, due=at)
+        run.runs(GRAB, at + 50, at + 51, at + 50.5, ready=at + 0.1, due=at, thread=SCAN)
+        run.detects(at + 50.5)
+    causes = run.result(300)['misses']['causes']
+    assert (causes['interpreter'], causes['waited']) == (3, 0)
+
+
 def test_the_same_run_gets_the_same_verdicts(tmp_path, call):
     trace, graph = tmp_path / 'run.mcap', tmp_path / 'graph.yaml'
     graph.write_text(undeclared(DEMO, trace))
