@@ -216,22 +216,20 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
         return Drift('rate', callback.key, None, period, None, printable(
             f'{callback.key} was released once in {observed.duration_ns / 1e9:.3f} s, and every '
             f"{format_duration(period)} is declared: if it fires once, declare 'once: true'"))
-    if releases.count > 1 and not callback.sporadic and not callback.once and (
-            observed.end_ns - releases.last > max(SILENCE_NS, LEAST * period)):
-        silent = observed.end_ns - releases.last
+    mean = releases.mean_ns() if releases.count >= LEAST else period
+    if abs(mean - period) > TOLERANCE * period and not (callback.sporadic and mean > period):
+        text = (f'{callback.key} was released every {format_duration(mean)}, and '
+                f'{format_duration(period)} is declared')
+        if mean > period and callback.kind != 'timer':
+            text += ": if it has no fixed rate, declare 'sporadic: true'"
+        return Drift('rate', callback.key, None, period, mean, printable(text))
+    silent = observed.end_ns - releases.last
+    if releases.count > 1 and silent > max(SILENCE_NS, LEAST * period) and not (
+            callback.sporadic or callback.once):
         return Drift('stopped', callback.key, None, period, silent, printable(
             f'{callback.key} was not released any more in the last {silent / 1e9:.3f} s, and '
             f'every {format_duration(period)} is declared'))
-    if releases.count < LEAST:
-        return None
-    mean = releases.mean_ns()
-    if abs(mean - period) <= TOLERANCE * period or callback.sporadic and mean > period:
-        return None
-    text = (f'{callback.key} was released every {format_duration(mean)}, and '
-            f'{format_duration(period)} is declared')
-    if mean > period and callback.kind != 'timer':
-        text += ": if it has no fixed rate, declare 'sporadic: true'"
-    return Drift('rate', callback.key, None, period, mean, printable(text))
+    return None
 
 
 def _due_by_runs(
