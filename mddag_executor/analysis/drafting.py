@@ -35,7 +35,7 @@ from mddag_executor.recording.mapping import declared_keys
 from mddag_executor.recording.names import Callback, KINDS
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
-from mddag_executor.sources.open import open_to_draft
+from mddag_executor.sources.open import open_to_draft, Traces
 from msg_graph import Callback as Declared
 from msg_graph import EMPTY_TASK_SET, ExecutionTime, TaskSet
 from msg_graph.binding import function_of, is_background
@@ -85,15 +85,16 @@ class System:
     """
     The recorded system, as far as a trace shows it.
 
-    :param path: a trace of this executor, or an imported recording of CARET or ros2_tracing.
+    :param path: a trace of this executor, those of all processes of one run, or an imported
+        recording of CARET or ros2_tracing.
     :ivar warnings: missing data of the trace, one line each.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], name: str | None = None,
+        self, path: str | os.PathLike[str] | Traces, name: str | None = None,
         progress: Callable[[int], None] | None = None,
     ) -> None:
-        self.name = name or os.fspath(path)
+        self.name = name or str(path)
         recording = open_to_draft(path, self.name, progress)
         declared = recording.run.declared
         self.task_set: TaskSet | None = recording.task_set if declared else None
@@ -256,7 +257,12 @@ class System:
             _join(node, driver, [each for each in several if each is not driver], topic, why)
 
     def _processes(self, nodes: list[str]) -> dict[str, list[str]]:
-        """Return the given nodes of each process; none if there is one process."""
+        """Return the given nodes of each process, as declared; none if there is one process."""
+        if self.task_set is not None and self.task_set.processes:
+            declared = {process.name: [node for node in process.nodes if node in nodes]
+                        for process in self.task_set.processes}
+            declared = {name: mine for name, mine in declared.items() if mine}
+            return declared if len(declared) > 1 else {}
         pids = {entity.node.name: entity.node.pid for entity in reversed(self._entities)
                 if entity.node is not None}
         found: dict[str, list[str]] = {}

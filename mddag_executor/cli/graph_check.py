@@ -63,7 +63,7 @@ def main(args: argparse.Namespace) -> int:
     tests = result['tests']
     warn(*_warnings(task_set, result))
     common.show(args, result, (
-        table(_HEADER, _rows(result), grouped=5), *_bounds(result), *_tests(result),
+        table(_HEADER, _rows(result), grouped=5), *_bounds(result), *_tests(task_set, result),
         _summary(task_set, result)))
     return int(args.fail_on_unschedulable and not all(test['holds'] for test in tests))
 
@@ -98,7 +98,7 @@ def check_result(task_set: TaskSet, workers: int, budget: str) -> CheckResult:
         'load': load,
         'utilisation': None if load is None else load / workers,
         'budget': budget,
-        'tests': [] if load is None or not task_set.dags else [
+        'tests': [] if _untimed(task_set) or not task_set.dags else [
             {'test': each.test, 'holds': each.holds, 'figure': each.figure,
              'reason': each.reason, 'details': each.details}
             for each in necessary_tests(task_set, workers, budget)],
@@ -186,7 +186,17 @@ def _bounds(result: CheckResult) -> Iterator[str]:
         yield bounds_table(result['requirements'])
 
 
-def _tests(result: CheckResult) -> Iterator[str]:
+def _untimed(task_set: TaskSet) -> list[str]:
+    """Return the callbacks that declare no execution time."""
+    return [each.key for each in task_set.callbacks if each.execution_time is None]
+
+
+def _tests(task_set: TaskSet, result: CheckResult) -> Iterator[str]:
+    untimed = _untimed(task_set)
+    if 0 < len(untimed) < len(task_set.callbacks):
+        yield ('whether the deadlines can hold is not tested, as '
+               f'{counted(len(untimed), "callback declares", "callbacks declare")} no '
+               f'execution_time: {listed(untimed)}')
     if result['tests']:
         yield table(
             ('test', 'verdict', f'figure ({result["budget"]} execution times)'),

@@ -16,11 +16,16 @@ if TYPE_CHECKING:
     from mddag_executor.analysis.drafting import System
 
 
-def recorded_system(given: str) -> System:
-    """Return the system in a trace (`-`: standard input), or in a session of LTTng (a folder)."""
+def recorded_system(*paths: str) -> System:
+    """
+    Return the system in a trace (`-`: standard input), or in a session of LTTng (a folder).
+
+    :param paths: several, or their folder: the traces of all processes of one run.
+    """
     from mddag_executor.analysis.drafting import System
+    given = common.one_run(paths, ())
     with Progress('reading the trace') as line:
-        if given != '-' and Path(given).is_dir():
+        if isinstance(given, str) and given != '-' and Path(given).is_dir():
             from mddag_executor.trace import import_ctf
             from mddag_executor.trace.reader import no_trace
             traces = any(Path(given).glob('*.mcap')) or not any(Path(given).iterdir())

@@ -126,7 +126,8 @@ def sinks_html(data: ReportData) -> str:
     rows = [(sink.dag, sink.shown_name, *cells(sink), _reached_bar(_reached(sink)))
             for sink in ranked]
     shown = html_table(
-        [*header, 'max of deadline'], rows, 2, range(header.index('late'), header.index('median')),
+        [*header, 'max of deadline'], rows, 2,
+        [i for i in range(header.index('late'), header.index('median')) if header[i] != 'not due'],
         [f'data-dag="{escape(printable(sink.dag))}"' + ' hidden' * (i >= MOST_ROWS)
          for i, sink in enumerate(ranked)])
     return data_table(

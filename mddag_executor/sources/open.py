@@ -82,9 +82,11 @@ def open_recording(
 
 
 def open_to_draft(
-    path: str | os.PathLike[str], name: str, progress: Progress | None = None
+    path: str | os.PathLike[str] | Traces, name: str, progress: Progress | None = None
 ) -> Recording:
     """Read a trace to draft a declaration, by the recorded one, if any; see ``open_recording``."""
+    if isinstance(path, Traces):    # of a declared run
+        return open_recording(path, None, name, progress)
     with named_errors(os.fspath(path), name):
         reader = TraceReader(path)
         head = read_head(reader)

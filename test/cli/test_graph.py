@@ -30,6 +30,30 @@ def test_utilisation_is_one_thing_in_all_commands(call, tmp_path):
         assert result.get('load', 0.4) == 0.4
 
 
+@pytest.mark.parametrize('untimed', [
+    '{name: slow, timer: 1s, dag: slow, deadline: 1s}',
+    '{name: start, timer: 1s, dag: start, once: true, deadline: 1s}'])
+def test_without_an_execution_time_nothing_is_tested_and_a_line_says_so(call, tmp_path, untimed):
+    (tmp_path / 'g.yaml').write_text(
+        'mddag: 1\nworkers: 2\nnodes:\n  - node: /n\n    callbacks:\n'
+        '      - {name: t, timer: 10ms, dag: t, deadline: 10ms, execution_time: 4ms}\n'
+        f'      - {untimed}\n')
+    status, out, err = call('graph', 'check', 'g.yaml', cwd=tmp_path)
+    assert (status, err) == (0, '')
+    name = untimed[7:].partition(',')[0]
+    assert ('\nwhether the deadlines can hold is not tested, as 1 callback declares no '
+            f'execution_time: /n:{name}\n') in out
+    assert call('graph', 'check', 'g.yaml', '--json', '-', cwd=tmp_path).result['tests'] == []
+
+
+def test_a_draft_needs_the_traces_of_one_run(call, tmp_path):
+    done = call('graph', 'from-trace', BAG, '-', '-o', 'g.yaml', cwd=tmp_path)
+    assert done.returncode == 2 and 'of several traces none can be standard input' in done.stderr
+    (tmp_path / 'run').mkdir()
+    shutil.copy(BAG, tmp_path / 'run')
+    assert call('graph', 'from-trace', 'run', '-o', 'g.yaml', cwd=tmp_path).returncode == 0
+
+
 def test_schema(call, tmp_path):
     assert call('graph', 'schema').result == schema()
     assert call('graph', 'schema', '-o', 's.json', cwd=tmp_path) == (0, '', '')

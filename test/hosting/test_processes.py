@@ -10,13 +10,15 @@ import signal
 import subprocess
 import sys
 
-from mddag_executor import replay
+from mddag_executor import replay, Traces
+from mddag_executor.analysis.drafting import System
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
 from mddag_executor.executor.session import Session
 from mddag_executor.hosting import processes
 from mddag_executor.trace import read_events
 from msg_graph import loads
+from msg_graph.draft import accept, declaration_of
 import pytest
 
 from ..conftest import wait_for_run
@@ -162,6 +164,14 @@ def test_programs_run_in_the_process_of_their_nodes(world):
     # in addition to what waited 0.1 s for its announcement, as on a busy machine
     assert 0 <= replayed.due - live.due <= result['undeclared']
     assert live.due > 0
+    # all traces together make a declaration, with the processes and the measured times
+    draft = System(Traces(['up.mcap', 'down.mcap'])).draft()
+    accept(draft)
+    drafted = declaration_of(draft, True)
+    assert {p.name: {'/sensor', '/first', '/second', '/last'} & set(p.nodes)
+            for p in loads(drafted).processes} == {
+        'up': {'/sensor', '/first'}, 'down': {'/second', '/last'}}
+    assert '/mddag/jobs' not in drafted
 
 
 def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):

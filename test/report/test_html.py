@@ -25,7 +25,7 @@ from mddag_executor.report.html_data import (
     page_data,
     shown_misses,
 )
-from mddag_executor.report.html_tables import html_table
+from mddag_executor.report.html_tables import html_table, sinks_html
 from mddag_executor.report.perfetto import write_perfetto
 from mddag_executor.whatif.run_writer import write_trace
 import msg_graph
@@ -147,6 +147,15 @@ def test_bars_of_the_table_have_the_colours_of_the_legend(tmp_path):
     assert '<i class="least"' in text       # 7 of 8 ms: 12.5 % are left
     legend = text[text.index('class="legend"'):]
     assert '<i class="least"></i>slack below 10 %' in legend
+
+
+def test_what_is_not_due_is_not_marked_as_bad():
+    task_set = runs.autoware()
+    data = html.of_run(task_set, *runs.simulated(task_set, ms=50))
+    sink = next(iter(next(iter(data.result['dags'].values()))['sinks'].values()))
+    sink.update(late=12345, not_due=67890)
+    cells = dict(re.findall(r'<td( class="bad")?>(12345|67890)<', sinks_html(data)))
+    assert cells == {' class="bad"': '12345', '': '67890'}
 
 
 def test_a_run_without_graph_shows_its_messages_and_nothing_of_misses(tmp_path):
