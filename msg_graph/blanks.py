@@ -17,6 +17,6 @@ def open_blanks(text: str, file: str) -> list[GraphError]:
     return [GraphError(
         file, number,
         f"{match[1] or 'this'} is a blank to fill in ({match[2]})",
-        "correct the value and take the '# ' away" if match[1] else 'do so, then remove the line')
+        "correct the value and remove the '# '" if match[1] else 'do so, then remove the line')
         for number, line in enumerate(text.splitlines(), 1)
         if MARK in line and (match := _OPEN.fullmatch(line)) is not None]

@@ -232,7 +232,7 @@ class _Writer:
         if self._accepted:
             yield "# Values marked 'proposed' come from the recording, not from requirements."
         else:
-            yield f"# Lines with '{MARK}' are blanks: correct the value, then take the '# ' away."
+            yield f"# Lines with '{MARK}' are blanks: correct the value, then remove the '# '."
             yield "# 'mddag graph check' lists what is still open."
         yield from (f'{LEFT_OUT} {printable(text)}' for text in self._draft.left_out)
         yield 'mddag: 1'

@@ -102,5 +102,5 @@ def _share(text: str) -> float:
     """Return a share; `10` may mean 10 %, or ten times as much."""
     value = options.share(text)
     if value > 1 and not text.endswith('%'):
-        raise argparse.ArgumentTypeError(f'{text!r} is no share: write 10% or 0.1')
+        raise argparse.ArgumentTypeError(f'{text!r} is not a share: write 10% or 0.1')
     return value

@@ -248,4 +248,4 @@ def _silence_stdout() -> None:
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError):
-        pass  # stdout is no file descriptor (captured by a test), or is closed already
+        pass  # stdout is not a file descriptor (captured by a test), or is closed already

@@ -284,7 +284,7 @@ class MultiDeadlineExecutor(BareExecutor):
         :raises RuntimeError: when the executor was shut down.
         """
         if not hasattr(node, 'executor'):
-            raise TypeError(f'{node!r} is no node: add an rclpy.node.Node')
+            raise TypeError(f'{node!r} is not a node: add an rclpy.node.Node')
         if self.is_gone():
             raise RuntimeError('The executor was shut down: add the node to a new one')
         added: bool = super().add_node(node)

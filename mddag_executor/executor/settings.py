@@ -90,7 +90,7 @@ class Thresholds:
         for field in ('warn_ratio', 'error_ratio'):
             value = getattr(self, field)
             if not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
-                raise UsageError(f'{field}: {value} is no share: give more than 0, at most 1')
+                raise UsageError(f'{field}: {value} is not a share: give more than 0, at most 1')
         for field in ('warn_burst', 'window', 'stale_periods'):
             whole_number(field, getattr(self, field), MOST_JOBS)
 
@@ -137,8 +137,8 @@ def resolve(
     """
     task_set = load(graph) if isinstance(graph, (str, os.PathLike)) else graph
     if task_set is not None and not isinstance(task_set, TaskSet):
-        raise UsageError(f'graph: {graph!r} is no declaration: give the path of one, a TaskSet, '
-                         'or None' + (f'; a number of threads is num_workers={graph}'
+        raise UsageError(f'graph: {graph!r} is not a declaration: give the path of one, a '
+                         'TaskSet, or None' + (f'; a number of threads is num_workers={graph}'
                                       if type(graph) is int else ''))
     if num_threads is not None:
         if num_workers is not None:

@@ -329,8 +329,8 @@ class Host:
             if nodes is None:
                 if not guest.uses_ros and not isinstance(value, int):
                     raise LoadingError(
-                        guest.program.spec, f'it returned a {type(value).__name__}, which is no '
-                        'rclpy node', 'let it return a node, a list of nodes, or nothing')
+                        guest.program.spec, f'it returned a {type(value).__name__}, which is not '
+                        'an rclpy node', 'let it return a node, a list of nodes, or nothing')
                 raise SystemExit(value)  # as a console script passes it to sys.exit
             guest.returned = bool(nodes)
             for node in nodes:

@@ -206,7 +206,7 @@ def _script(spec: str, path: Path) -> Program:
     first_line = source.split(b'\n', 1)[0]
     if not (path.suffix == '.py' or first_line.startswith(b'#!') and b'python' in first_line):
         raise LoadingError(
-            spec, f'only Python nodes can run in this process, and {path} is no Python program',
+            spec, f'only Python nodes can run in this process, and {path} is not a Python program',
             "start it by itself with 'ros2 run'")
     try:
         code = compile(source, str(path), 'exec')

@@ -55,7 +55,7 @@ def read_samples(task_set: TaskSet, path: Path, name: str) -> dict[str, Times]:
     except _DAMAGED:
         archive = None
     if not isinstance(archive, np.lib.npyio.NpzFile):
-        raise InputError(name, 'this is no .npz file', _REMEDY)
+        raise InputError(name, 'this is not a .npz file', _REMEDY)
     with archive:
         return {key: _read_values(archive, key, name)
                 for key in {vertex.callback.key: None for vertex in task_set.vertices}}

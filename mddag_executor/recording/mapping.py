@@ -67,7 +67,7 @@ def judged_by(recording: Recording, judge: TaskSet | None) -> Recording:
         missing.append(Loss(
             'callbacks', len(unreleased),
             f'{judge.file}: {counted(len(unreleased), "DAG")} without jobs, because the '
-            f'source is no source in the recording: {listed(unreleased)}'))
+            f'source is not a source in the recording: {listed(unreleased)}'))
     dag, vertex = np.array([*dags, -1]), np.array([*vertices, -1])
     n_legs = max(map(len, legs), default=1)
     leg = np.array([[*each, *[-1] * (n_legs - len(each))] for each in [*legs, []]])

@@ -204,7 +204,7 @@ class Recording:
         :raises mddag_executor.ReplayError: if it begins after the recording.
         """
         if not 0 <= begin < end:
-            raise ValueError(f'from {begin} to {end} ns is no range of time')
+            raise ValueError(f'from {begin} to {end} ns is not a range of time')
         if self.start is None:      # empty recording
             return self
         if begin > self.end - self.start:

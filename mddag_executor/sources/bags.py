@@ -349,7 +349,7 @@ def _named_files(metadata: Path) -> tuple[list[str], int | None]:
     except (OSError, ValueError, GraphError) as error:
         what = error.problem if isinstance(error, GraphError) else ' '.join(str(error).split())
         raise BagError(
-            str(metadata), f'this is no metadata of a bag ({what[:200]})', REMEDY) from None
+            str(metadata), f'this is not the metadata of a bag ({what[:200]})', REMEDY) from None
 
 
 @contextmanager

@@ -67,14 +67,14 @@ def kind_of(file: Path) -> bytes:
     """Return the first bytes of a bag file, which say its kind."""
     try:
         if not file.is_file():
-            raise BagError(str(file), 'is no file', REMEDY)
+            raise BagError(str(file), 'is not a file', REMEDY)
         with open(file, 'rb') as stream:
             head = stream.read(32)
     except OSError as error:
         raise BagError(str(file), f'cannot be read ({error.strerror})', REMEDY) from None
     except ValueError:
-        raise BagError(str(file), 'is no file name', REMEDY) from None
+        raise BagError(str(file), 'is not a file name', REMEDY) from None
     for kind in (MCAP, SQLITE, ZSTD):
         if head.startswith(kind):
             return kind
-    raise BagError(str(file), *(other_kind(head) or ('is no rosbag2 recording', REMEDY)))
+    raise BagError(str(file), *(other_kind(head) or ('is not a rosbag2 recording', REMEDY)))

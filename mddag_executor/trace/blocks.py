@@ -165,7 +165,7 @@ def open_data(stream: BinaryIO, path: str, size: int) -> tuple[int, str]:
     if not start:
         raise TraceError(path, 'is empty', _REMEDY)
     if not start.startswith(records.MAGIC):
-        raise TraceError(path, *(other_kind(start) or ('is no MCAP file', _REMEDY)))
+        raise TraceError(path, *(other_kind(start) or ('is not an MCAP file', _REMEDY)))
     stream.seek(len(records.MAGIC))
     head = stream.read(records.RECORD.size)
     if len(head) == records.RECORD.size:

@@ -59,10 +59,10 @@ class FieldType:
         """
         match = _TYPE.fullmatch(text)
         if match is None:
-            raise ValueError(f'type {text!r} is no primitive')
+            raise ValueError(f'type {text!r} is not a primitive')
         base, bound, array, length = match.groups()
         if base != 'string' and (base not in _CODES or bound):
-            raise ValueError(f'type {text!r} is no primitive')
+            raise ValueError(f'type {text!r} is not a primitive')
         if array is None:
             return cls(base)
         return cls(base, int(length) if length else -1)
@@ -295,7 +295,7 @@ def parse_ros2msg(text: str) -> list[tuple[str, FieldType]]:
             continue
         match = _FIELD.fullmatch(line)
         if match is None:
-            raise ValueError(f'line {line[:40]!r} is no field')
+            raise ValueError(f'line {line[:40]!r} is not a field')
         fields.append((match[2], FieldType.parse(match[1])))
     if len({name for name, _ in fields}) != len(fields):
         raise ValueError('a field is there twice')

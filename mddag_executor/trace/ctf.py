@@ -183,7 +183,7 @@ def _metadata_in(folder: str) -> Metadata:
         text = data.decode()
         return parse_ctf2(text) if is_ctf2(text) else parse_tsdl(text)
     except UnicodeDecodeError as error:
-        raise TraceError(path, f'cannot be read (it is no text at byte {error.start})',
+        raise TraceError(path, f'cannot be read (it is not text at byte {error.start})',
                          _RECORD) from None
     except MetadataError as error:
         raise TraceError(path, f'cannot be read ({error})', _RECORD) from None
@@ -199,7 +199,7 @@ def _session_in(path: str) -> _Session:
     if '\0' in path or not os.path.exists(path):
         raise TraceError(path, 'there is no such folder', remedy)
     if not os.path.isdir(path):
-        raise TraceError(path, 'is no folder', remedy)
+        raise TraceError(path, 'is not a folder', remedy)
     folders = sorted(folder for folder, _, names in os.walk(path) if 'metadata' in names)
     if not folders:
         what = 'holds no CTF recording (no file called metadata is in it or below)'

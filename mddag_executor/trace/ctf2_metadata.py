@@ -89,7 +89,7 @@ def _fragments(text: str) -> Iterator[_Object]:
         except ValueError:
             raise MetadataError(f'its fragment {number} is cut or no JSON') from None
         if not isinstance(found, dict):
-            raise MetadataError(f'its fragment {number} is no JSON object')
+            raise MetadataError(f'its fragment {number} is not a JSON object')
         yield found
 
 
@@ -112,28 +112,28 @@ def _is_integer(value: Any) -> bool:
 def _number(found: _Object, key: str, default: int | None = None) -> int:
     value: int = _value(found, key, default)
     if not _is_integer(value):
-        _wrong(f'{key!r} is no integer of 64 bits', found)
+        _wrong(f'{key!r} is not an integer of 64 bits', found)
     return value
 
 
 def _text(found: _Object, key: str, default: str | None = None) -> str:
     value = _value(found, key, default)
     if not isinstance(value, str):
-        _wrong(f'{key!r} is no text', found)
+        _wrong(f'{key!r} is not text', found)
     return value
 
 
 def _objects(found: _Object, key: str) -> Sequence[_Object]:
     value = _value(found, key, [])
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
-        _wrong(f'{key!r} is no array of objects', found)
+        _wrong(f'{key!r} is not an array of objects', found)
     return value
 
 
 def _object(found: _Object, key: str) -> _Object:
     value = _value(found, key, {})
     if not isinstance(value, dict):
-        _wrong(f'{key!r} is no object', found)
+        _wrong(f'{key!r} is not an object', found)
     return value
 
 
@@ -230,7 +230,7 @@ class _Parser:
         self._origin, self._renamed[origin] = origin, {}
         found = self._type(given)
         if not isinstance(found, Struct):
-            _wrong(f'{origin!r} is no structure', fragment)
+            _wrong(f'{origin!r} is not a structure', fragment)
         return found
 
     # --- types -----------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ class _Parser:
             else:
                 break
         if not isinstance(given, dict):
-            raise MetadataError(f'{str(given)[:40]!r} is no type')
+            raise MetadataError(f'{str(given)[:40]!r} is not a type')
         return given
 
     def _made(self, kind: str, found: _Object) -> Type:
@@ -306,7 +306,7 @@ class _Parser:
     def _roles(self, found: _Object) -> Sequence[str]:
         roles = found.get('roles', [])
         if not isinstance(roles, list) or not all(isinstance(each, str) for each in roles):
-            _wrong("'roles' is no array of texts", found)
+            _wrong("'roles' is not an array of texts", found)
         return roles
 
     def _array(self, found: _Object, element: Type) -> Type:

@@ -262,12 +262,12 @@ def smallest(kind: Type) -> int:
 def size_of(value: int, most: int) -> int:
     """Return a size, or raise MetadataError if it is not possible."""
     if not 1 <= value <= most:
-        raise MetadataError(f'{str(value)[:40]!r} is no possible size')
+        raise MetadataError(f'{str(value)[:40]!r} is not a possible size')
     return value
 
 
 def alignment_of(value: int) -> int:
     """Return an alignment, or raise MetadataError if it is not possible."""
     if not 1 <= value <= 4096 or value & value - 1:
-        raise MetadataError(f'{str(value)[:40]!r} is no possible alignment')
+        raise MetadataError(f'{str(value)[:40]!r} is not a possible alignment')
     return value

@@ -30,13 +30,13 @@ from mddag_executor.trace.schema import PROCESS
 
 def _opened(path: str) -> BinaryIO:
     if '\0' in path:
-        raise TraceError(path, 'is no file name', 'give the .mcap file')
+        raise TraceError(path, 'is not a file name', 'give the .mcap file')
     try:
         mode = os.stat(path).st_mode
         if stat.S_ISDIR(mode):
             raise no_trace(path)
         if not stat.S_ISREG(mode):      # opening a pipe would wait for its writer
-            raise TraceError(path, 'is no file', 'give the .mcap file itself')
+            raise TraceError(path, 'is not a file', 'give the .mcap file itself')
         return open(path, 'rb')
     except OSError as error:
         raise unreadable(path, error) from None

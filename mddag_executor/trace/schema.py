@@ -47,7 +47,7 @@ class EventType:
         names = [name for name, _ in PREAMBLE + self.fields]
         for name in (self.provider, self.name, *names):
             if not _NAME.fullmatch(name):
-                raise ValueError(f'{name!r} in event {self.key} is no ROS name')
+                raise ValueError(f'{name!r} in event {self.key} is not a ROS name')
         if len(set(names)) != len(names):
             raise ValueError(f'event {self.key} has a field twice')
         for _, kind in self.fields:

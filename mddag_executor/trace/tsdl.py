@@ -81,7 +81,7 @@ def _unquoted(text: str) -> str:
 def _number(text: str) -> int:
     match = _NUMBER.fullmatch(text)
     if match is None:
-        raise MetadataError(f'{text[:40]!r} is no number')
+        raise MetadataError(f'{text[:40]!r} is not a number')
     digits = match[1]
     value = int(digits, 8) if re.fullmatch(r'0[0-7]+', digits) else int(digits, 0) if (
         digits[1:2].isalpha()) else int(digits)
@@ -121,7 +121,7 @@ class _Parser:
 
     def _is_big(self, text: str) -> bool:
         if text not in ('le', 'be', 'network', 'native'):
-            raise MetadataError(f'{text[:40]!r} is no byte order')
+            raise MetadataError(f'{text[:40]!r} is not a byte order')
         return self._big if text == 'native' else text != 'le'
 
     # --- tokens ----------------------------------------------------------------------------------

@@ -223,7 +223,8 @@ def test_callbacks_that_the_trace_lacks(tmp_path):
     assert outcome.warnings == [
         f'{path}: not in it: 1 of the 8 callbacks of more.yaml, which count as never completed: '
         '/radar:scan',
-        'more.yaml: 1 DAG without jobs, because the source is no source in the recording: /radar']
+        'more.yaml: 1 DAG without jobs, because the source is not a source in the recording: '
+        '/radar']
     assert outcome.result()['dags']['/radar']['jobs'] == 0
 
 

@@ -211,7 +211,7 @@ def test_a_bag_and_its_parts():
     assert part.start == (recording.start or 0) + 200 * MS
     assert 0 < len(part.executions) < len(recording.executions) / 2
     for begin, end in ((-1, 5), (5, 5)):
-        with pytest.raises(ValueError, match='is no range of time'):
+        with pytest.raises(ValueError, match='is not a range of time'):
             recording.cut(begin, end)
     with pytest.raises(ReplayError, match='it ends 1.4.. s after its first release'):
         recording.cut(10 ** 12, 2 ** 62)

@@ -46,8 +46,8 @@ def test_standard_input(trace, call):
     assert err.startswith('warning: <stdin>: the summary')
     assert json.loads(out)['recording']['trace'] == '<stdin>'
     assert call('replay', '-', stdin=b'nonsense') == (
-        2, '', 'error: <stdin>: is no MCAP file: give a trace written by this program or another '
-        'MCAP recording\n')
+        2, '', 'error: <stdin>: is not an MCAP file: give a trace written by this program or '
+        'another MCAP recording\n')
     assert call('replay', trace, '-', stdin=GRAPH)[::2] == (0, '')
 
 

@@ -65,7 +65,7 @@ def node(ros_context):
 
 def test_what_is_no_node_and_no_timeout(executor):
     for wrong in (None, 5, 'node', object()):
-        with pytest.raises(TypeError, match='is no node'):
+        with pytest.raises(TypeError, match='is not a node'):
             executor.add_node(wrong)
     for wrong in ('x', [], {}, 1j):
         with pytest.raises(TypeError):

@@ -479,7 +479,7 @@ def test_a_second_interrupt_leaves_no_group_open(host):
     ('chat:exits_early', 'it ended while starting (SystemExit: 5'),
     ('chat:own_context', 'node /alone has a context of its own: let it use the default context'),
     ('chat:other_domain', 'it asks for ROS domain 7, and this process is in another: set '),
-    ('chat:returns_text', 'it returned a str, which is no rclpy node'),
+    ('chat:returns_text', 'it returned a str, which is not an rclpy node'),
     ('chat:returns_nothing', 'it ended and neither returned a node nor initialised rclpy'),
 ])
 def test_a_program_that_cannot_start(world, default_context, spec, message):

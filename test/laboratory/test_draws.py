@@ -56,7 +56,7 @@ UNFIT = ([], [[1]], ['x'], np.array([{}]), [1, -1], [1, float('nan')], [10 ** 18
 
 
 @pytest.mark.parametrize(('content', 'problem'), [
-    (b'', 'this is no .npz file'), (npz(**GOOD)[:-30], 'this is no .npz file'),
+    (b'', 'this is not a .npz file'), (npz(**GOOD)[:-30], 'this is not a .npz file'),
     *((npz(**{**GOOD, '/n:b': values}), 'the values of /n:b are damaged, or no list of ns')
       for values in UNFIT),
 ])

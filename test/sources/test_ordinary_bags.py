@@ -178,10 +178,10 @@ def test_files_that_are_missing_are_said(tmp_path, kind):
     files[1].unlink()
     half = Bag(bag, {'/rosout'})
     assert len(half.stamps['/rosout'].header) == 10
-    assert half.warnings == [f'{files[1]}: is no file: it is left out']
+    assert half.warnings == [f'{files[1]}: is not a file: it is left out']
     files[0].unlink()
     assert is_ordinary(str(bag))       # not a folder without a trace
-    with pytest.raises(BagError, match='is no file: it is left out'):
+    with pytest.raises(BagError, match='is not a file: it is left out'):
         read_bag(bag, loads(OF_USERS, 'g.yaml'))
 
 
@@ -216,7 +216,7 @@ def test_hostile_files(tmp_path):
 
     for path, says in ((other, 'its SQLite storage cannot be read'),
                        (text, 'its SQLite storage cannot be read'),
-                       (tmp_path / 'gone', 'is no file'),
+                       (tmp_path / 'gone', 'is not a file'),
                        (killed, r'its last messages are in killed\.db3-wal .*: let ros2 bag '),
                        (folder, 'there is neither metadata.yaml nor a bag file')):
         refuse(path, says)
@@ -224,7 +224,7 @@ def test_hostile_files(tmp_path):
     for metadata in ('', '[', '- 1', files % '[]', files % '[[]]', '\x00', '[' * 900,
                      '!!python/object:os.system x'):
         (folder / 'metadata.yaml').write_text(metadata)
-        refuse(folder, r'/metadata.yaml: this is no metadata of a bag \(')
+        refuse(folder, r'/metadata.yaml: this is not the metadata of a bag \(')
 
 
 def test_a_folder_says_what_is_in_it(tmp_path):
@@ -344,7 +344,7 @@ def test_damaged_metadata_is_as_if_it_were_missing(tmp_path, metadata):
     path = write_bag(tmp_path / 'bag')
     (path / 'metadata.yaml').write_text(metadata)
     warning, = (outcome := reschedule_bag(path, TASK_SET)).warnings
-    assert 'metadata.yaml: this is no metadata of a bag (' in warning
+    assert 'metadata.yaml: this is not the metadata of a bag (' in warning
     assert 'NoneType' not in warning and warning.endswith(': used 1 bag file from the folder')
     assert outcome.result()['dags']['/lidar']['jobs'] == 10
 

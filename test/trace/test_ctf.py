@@ -298,8 +298,8 @@ DOUBLED = ' '.join(f'struct a{n + 1} {{ struct a{n} x; struct a{n} y; }};' for n
     (f'struct a0 {{ }}; {DOUBLED}', 'struct a40 a;', 'more than 5000 members'),
     ('struct a0 { };', 'struct a0 a[4294967295];', 'without a size'),
     ('', 'uint32_t n; struct { } a[n];', 'without a size'),
-    ('', 'integer { size = 4294967295; } a;', 'no possible size'),
-    ('', 'integer { size = 32; align = 7; } a;', 'no possible alignment'),
+    ('', 'integer { size = 4294967295; } a;', 'not a possible size'),
+    ('', 'integer { size = 32; align = 7; } a;', 'not a possible alignment'),
     ('', 'uint32_t a' + '[2]' * 40 + ';', 'not understood'),
     ('', 'unknown_t a;', 'not understood'), ('', 'uint32_t a; uint32_t a;', 'not understood'),
     (' ' * 9_000_000, 'uint32_t a;', 'larger than 8 MiB'), ('\0', 'uint32_t a;', 'control char'),
@@ -353,10 +353,12 @@ WIDE = [alias('wide', {'type': 'structure', 'member-classes': [
 @pytest.mark.parametrize(('payload', 'more', 'says'), [
     (DEEP, (), 'nested too deep'), ('a40', TWICE, 'nested too deep'),
     ('a20', TWICE, 'more than 5000 members'), (U8, WIDE, 'more than 131072 types'),
-    ('a', [alias('a', 'b'), alias('b', 'a')], "'a' is no type"),
-    ('missing', (), "there is no type 'missing'"), (7, (), "'7' is no type"),
-    ({**U8, 'length': 65}, (), 'no possible size'), ({**U8, 'length': '8'}, (), 'no integer'),
-    ({**U8, 'length': 2 ** 70}, (), 'no integer'), ({**U8, 'alignment': 7}, (), 'no possible al'),
+    ('a', [alias('a', 'b'), alias('b', 'a')], "'a' is not a type"),
+    ('missing', (), "there is no type 'missing'"), (7, (), "'7' is not a type"),
+    ({**U8, 'length': 65}, (), 'not a possible size'),
+    ({**U8, 'length': '8'}, (), 'not an integer'),
+    ({**U8, 'length': 2 ** 70}, (), 'not an integer'),
+    ({**U8, 'alignment': 7}, (), 'not a possible al'),
     ({**U8, 'bit-order': 'last-to-first'}, (), 'the order of bits'),
     ({**U8, 'type': 'variable-length-unsigned-integer'}, (), 'is not read'),
     ({'type': 'null-terminated-string', 'encoding': 'utf-16le'}, (), 'not UTF-8'),
@@ -371,12 +373,12 @@ WIDE = [alias('wide', {'type': 'structure', 'member-classes': [
     ({'type': 'dynamic-length-blob', 'length-field-location': {'path': []}}, (), 'no path'),
     ({'type': 'variant', 'selector-field-location': {'path': ['b']}, 'options': []}, (),
      '0 ranges'),
-    (U8, [{'type': 'clock-class', 'id': 'slow', 'frequency': 0}], 'no possible size'),
-    (U8, [{'type': 'trace-class', 'environment': 1}], 'is no object'),
+    (U8, [{'type': 'clock-class', 'id': 'slow', 'frequency': 0}], 'not a possible size'),
+    (U8, [{'type': 'trace-class', 'environment': 1}], 'is not an object'),
     (U8, [{'type': 'preamble', 'version': 2}], 'only preamble'),
     (U8, [{'type': 'data-stream-class'}], 'two streams have the number 0'),
     (U8, [{'type': 'event-record-class', 'data-stream-class-id': 5}], 'is of no stream'),
-    (U8, [{'type': 'story'}], "the type 'story'"), (U8, [[]], 'is no JSON object')])
+    (U8, [{'type': 'story'}], "the type 'story'"), (U8, [[]], 'is not a JSON object')])
 def test_hostile_ctf2_is_refused(payload, more, says, tmp_path):
     folder = session(
         tmp_path / 's', [('a:b', [('rest', 'u64')])], [(0, 1, 1, 1, 'p', 2**64 - 1)],

@@ -136,11 +136,11 @@ def test_flipped_bits(tmp_path, sample):
 def test_what_is_no_file(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     for path, says in (
-            (tmp_path / 'pipe', 'is no file: give the .mcap file itself'),
-            ('/dev/zero', 'is no file: give the .mcap file itself'),
+            (tmp_path / 'pipe', 'is not a file: give the .mcap file itself'),
+            ('/dev/zero', 'is not a file: give the .mcap file itself'),
             (tmp_path / 'missing/a.mcap', 'no such file or directory: check the path'),
             (tmp_path / ('x' * 1000), r'cannot be read \(.*\): check its name'),
-            ('a\0b', 'is no file name'),
+            ('a\0b', 'is not a file name'),
             ('/proc/self/mem', r'/proc/self/mem: cannot be read \(Input/output error\)')):
         with pytest.raises(TraceError, match=says):
             TraceReader(path)

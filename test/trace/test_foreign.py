@@ -110,11 +110,12 @@ def test_an_event_that_is_not_in_the_table(tmp_path):
 
 
 @pytest.mark.parametrize('options, reason', [
-    ({'schema': PREAMBLE + 'std_msgs/Header callback'}, "type 'std_msgs/Header' is no primitive"),
+    ({'schema': PREAMBLE + 'std_msgs/Header callback'},
+     "type 'std_msgs/Header' is not a primitive"),
     ({'schema': PREAMBLE + 'string callback'}, 'field callback is string instead of uint64'),
     ({'schema': 'int64 timestamp\nuint64 callback'}, 'there is no field vpid'),
     ({'schema': 'string timestamp\nint32 vpid\nint32 vtid\n'}, 'timestamp is string'),
-    ({'schema': '\0\1\2'}, 'is no field'),
+    ({'schema': '\0\1\2'}, 'is not a field'),
     ({'schema': PREAMBLE, 'schema_encoding': 'protobuf'}, "'protobuf' instead of ros2msg"),
     ({'schema': PREAMBLE, 'encoding': 'json'}, "'json' instead of cdr"),
     ({'schema': PREAMBLE, 'data': b'\0\0' + HEAD[2:]}, 'not plain little endian CDR'),
