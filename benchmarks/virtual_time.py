@@ -125,7 +125,7 @@ def time_core(
 
     log = schedule(tables, load, settings, log=True).log
     vertex_jobs = sum(kind == END for _, kind, *_ in log)
-    events = len(log) + len(load.times)
+    events = len(log)
     taken = _seconds(simulate, repeat)
     legs = Tables.build(task_set, legs=True)
     live, live_jobs = 0.0, 0

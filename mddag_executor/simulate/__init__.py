@@ -4,7 +4,7 @@
 
 from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.policies import ALL_POLICIES, policy
-from mddag_executor.simulate.pool import END, LogEntry, PREEMPT, START
+from mddag_executor.simulate.pool import END, JOB_ENDED, LogEntry, PREEMPT, RELEASE, START
 from mddag_executor.simulate.run import JUDGES, simulate, SimulatedRun
 from mddag_executor.simulate.schedule import schedule, Scheduled, Settings
 from mddag_executor.simulate.workload import (
@@ -16,7 +16,8 @@ from mddag_executor.simulate.workload import (
 )
 
 __all__ = [
-    'ALL_POLICIES', 'END', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'START', 'Scheduled',
-    'Settings', 'SimulatedRun', 'draw_execution_times', 'periodic_load', 'policy',
-    'read_execution_times', 'scale_execution_times', 'schedule', 'simulate', 'utilisation',
+    'ALL_POLICIES', 'END', 'JOB_ENDED', 'JUDGES', 'Load', 'LogEntry', 'PREEMPT', 'RELEASE',
+    'START', 'Scheduled', 'Settings', 'SimulatedRun', 'draw_execution_times', 'periodic_load',
+    'policy', 'read_execution_times', 'scale_execution_times', 'schedule', 'simulate',
+    'utilisation',
 ]

@@ -33,8 +33,10 @@ from mddag_executor.core.state import (
     add_slot,
     EXPIRED,
     fill_state,
+    JOB_END,
     JUDGE_FROM,
     JUDGE_UNTIL,
+    OUTDATED,
     State,
 )
 from mddag_executor.core.tables import NEVER, Tables
@@ -57,7 +59,16 @@ from mddag_executor.simulate.machine import (
     share,
     starts,
 )
-from mddag_executor.simulate.pool import divide, END, fill_pool, Pool, PREEMPT, START
+from mddag_executor.simulate.pool import (
+    divide,
+    END,
+    fill_pool,
+    JOB_ENDED,
+    Pool,
+    PREEMPT,
+    RELEASE,
+    START,
+)
 
 
 class Orders(NamedTuple):
@@ -127,12 +138,16 @@ def run(
                     ends_sending(t, s, key, load, d, m, x, now)
                 else:
                     complete(t, s, key, x, now)
+                if o.keep_log != 0:
+                    _note_ends(t, s, p, now)
         if now == o.horizon:
             break
         if sends:
             arrive_due(t, s, key, load, d, m, now)
+            if o.keep_log != 0:
+                _note_ends(t, s, p, now)
         while next_release < n_releases and load.times[next_release] == now:
-            release_load(t, s, key, load, next_release, now)
+            release_load(t, s, p, key, load, o, next_release, now)
             next_release += 1
         _dispatch(t, s, p, d, m, key, load, o, now)
         if stops:
@@ -171,7 +186,7 @@ def _fill(
 
 
 def release_load(
-    t: Tables, s: State, key: KeyFunction, load: Load, i: int, now: int
+    t: Tables, s: State, p: Pool, key: KeyFunction, load: Load, o: Orders, i: int, now: int
 ) -> None:
     """Release the i-th job of a load, with its execution times."""
     dag = load.dags[i]
@@ -188,18 +203,24 @@ def release_load(
     if slot < 0:
         add_slot(t, s, dag)
         slot = release_job(t, s, dag, job, release, now)
+    if o.keep_log != 0:
+        _note_ends(t, s, p, now)
+        p.log.append((now, RELEASE, -1, dag, release, job))
     base = s.job_base[slot]
     source = t.region_offset[t.source[dag]]
-    if len(load.fates) > 0:
-        if load.fates[cost + source] == SKIPPED:
-            give_up(t, s, slot, EXPIRED, now)
-            return
+    if len(load.fates) > 0 and load.fates[cost + source] == SKIPPED:
+        give_up(t, s, slot, EXPIRED, now)
+        if o.keep_log != 0:
+            _note_ends(t, s, p, now)
+        return
     for place in range(t.n_region[dag]):
         s.x_cost[base + place] = s.x_left[base + place] = load.costs[cost + place]
     if len(load.holds) > 0:
         for place in range(t.n_region[dag]):
             s.x_holds[base + place] = load.holds[cost + place]
     make_ready(t, s, key, base + source, now)
+    if o.keep_log != 0:
+        _note_ends(t, s, p, now)
 
 
 def _dispatch(
@@ -234,6 +255,15 @@ def _dispatch(
 def _note(t: Tables, s: State, p: Pool, now: int, kind: int, worker: int, x: int) -> None:
     vertex = s.x_vertex[x]
     p.log.append((now, kind, worker, t.dag_of[vertex], vertex, s.job_index[s.x_slot[x]]))
+
+
+def _note_ends(t: Tables, s: State, p: Pool, now: int) -> None:
+    """Note the jobs that ended early, but did not fail, since the last call."""
+    for i in range(p.logged[0], len(s.decisions)):
+        kind, dag, _, job, end, _ = s.decisions[i]
+        if kind == JOB_END and (end == EXPIRED or end == OUTDATED):
+            p.log.append((now, JOB_ENDED, -1, dag, end, job))
+    p.logged[0] = len(s.decisions)
 
 
 def any_missed(s: State, first: int) -> bool:

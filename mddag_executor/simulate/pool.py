@@ -16,11 +16,15 @@ from mddag_executor.core.tables import NEVER, Tables
 PREEMPTIVE, POLLING, DISPATCH_OVERHEAD, SWITCH_OVERHEAD, POLLED_UNTIL = range(5)
 
 
-# Kinds of log entries.
-START, END, PREEMPT = range(3)
+# Kinds of log entries.  JOB_ENDED: a job ended early, but not because an execution failed.
+START, END, PREEMPT, RELEASE, JOB_ENDED = range(5)
 
 LogEntry = tuple[int, int, int, int, int, int]
-"""(time, kind, worker, DAG, global vertex, job): one change of a worker."""
+"""
+An entry of the log: time, kind, worker (or -1), DAG, vertex, job.
+
+``RELEASE`` has the release of the job instead of a vertex, ``JOB_ENDED`` how the job ended.
+"""
 
 
 class Pool(NamedTuple):
@@ -33,8 +37,10 @@ class Pool(NamedTuple):
     since: list[int]
     busy: list[int]
     running: list[int]
-    # every start, end and preemption, if wanted
+    # if wanted, the log: what happened, in the order in which the engine processed it; and how
+    # many decisions it contains already
     log: list[LogEntry]
+    logged: list[int]
     # if there are several processes: the process of each worker, from 1
     process: list[int]
     # under a policy that polls, by queue: the order number of its entry in the present round
@@ -62,6 +68,7 @@ def fill_pool(
         p.since.append(-1)
         p.busy.append(0)
         p.running.append(-1)
+    p.logged.append(0)
     if polling != 0:
         for _ in range(len(s.queue_first)):
             p.polled.append(-1)

@@ -5,12 +5,12 @@ A computed schedule as the recording of a run.
 
 Theory of operation
 -------------------
-The simulator and the rescheduler keep a log: which worker began, ended or preempted which vertex,
-and when.  With the load and the ends of jobs decided by the core this contains all data of a
-recording.  So every analysis works as on a recording and finds the same verdicts.
+The simulator and the rescheduler keep a log: the releases, starts, preemptions and ends of
+executions, and the early ends of jobs, in the order in which the engine processed them.  With the
+load and the core's decisions about sinks this contains all data of a recording.  So every analysis
+works as on a recording and finds the same verdicts.
 
-At the same instant ends of executions come first, then early ends of jobs, then releases, then
-starts, then ends of executions that took no time.  A vertex is ready when the last message that it
+A vertex is ready when the last message that it
 needs has arrived: at the end of the publishing execution, shifted by the delays of the load.  A
 preempted execution has several pieces, like a suspended coroutine.  A sync callback runs once for
 all of its legs.
@@ -42,7 +42,15 @@ from mddag_executor.recording.names import Names
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import UNKNOWN
-from mddag_executor.simulate import END, Load, LogEntry, SimulatedRun, START
+from mddag_executor.simulate import (
+    END,
+    JOB_ENDED,
+    Load,
+    LogEntry,
+    RELEASE,
+    SimulatedRun,
+    START,
+)
 from mddag_executor.simulate.load import edge_numbers, FAILS
 from mddag_executor.sources.executions import Numbering
 from msg_graph import TaskSet
@@ -60,7 +68,6 @@ class ComputedRun(NamedTuple):
     """
     A computed schedule.
 
-    :ivar horizon: no job is released then or later, ns.
     :ivar end: when it ended, ns; open jobs are then judged if ``judged``.
     :ivar numbers: by DAG the recorded numbers of the load's jobs; None: as in the load.
     :ivar judge_from: jobs released before are not judged; ``judged_releases``: range of judged
@@ -71,7 +78,6 @@ class ComputedRun(NamedTuple):
     load: Load
     log: Sequence[LogEntry]
     decisions: Sequence[Decision]
-    horizon: int
     end: int
     judged: bool = True
     numbers: Sequence[Ints] | None = None
@@ -81,10 +87,9 @@ class ComputedRun(NamedTuple):
     @classmethod
     def of_run(cls, task_set: TaskSet, load: Load, run: SimulatedRun) -> ComputedRun:
         """Return a run that was simulated with its log."""
-        horizon = run.settings.duration_ns
-        stopped = run.settings.stop_at_first_miss and run.ended_ns < horizon
+        stopped = run.settings.stop_at_first_miss and run.ended_ns < run.settings.duration_ns
         judged = run.settings.judge == 'horizon' and not stopped
-        return cls(task_set, load, run.log, run.decisions, horizon, run.ended_ns, judged)
+        return cls(task_set, load, run.log, run.decisions, run.ended_ns, judged)
 
     def recording(self, workers: int = 0) -> Recording:
         """
@@ -143,6 +148,11 @@ def _columns(rows: Sequence[tuple[int, ...]]) -> Ints:
     return found
 
 
+def _position(rows: Ints) -> Ints:
+    """Return the positions in the order of a recording for rows of the log."""
+    return 2 * rows + 2
+
+
 class _Tables:
     """Makes the tables of the recording."""
 
@@ -158,7 +168,9 @@ class _Tables:
     @cached_property
     def _pieces(self) -> _Pieces:
         now, kind, worker, dag, vertex, job = self._log
-        rows = sort_by(vertex, job)     # of each execution starts and stops alternate
+        rows = np.flatnonzero(kind < RELEASE)
+        # the starts and stops of each execution alternate
+        rows = rows[sort_by(vertex[rows], job[rows])]
         at = np.flatnonzero(kind[rows] == START)
         after = np.r_[rows, -1][at + 1]
         ends = np.where((after >= 0) & (kind[after] != START), after, -1)
@@ -179,37 +191,14 @@ class _Tables:
         return found
 
     def in_order(self) -> tuple[Table, Table, Table]:
-        """Return releases, executions and ends of jobs, with their positions in the order."""
-        load, pieces = self._load, self._pieces
+        """Return releases, executions and ends of jobs, with their positions in the log."""
+        pieces, kind = self._pieces, self._log[1]
         done = np.flatnonzero(pieces.ended & (pieces.dag < self._n_dags))
         done = done[sort_by(pieces.ends[done])]
-        rank = self._ranks(pieces.ends[done])
-        failed = self._fails(done)
-        early = self._early_ends()
-        released = np.flatnonzero(
-            (load.times < self._schedule.horizon) & (load.times <= self._schedule.end)
-            & (load.dags < self._n_dags))
-        # time, rank at that time, row of the log, position
-        keys: list[tuple[Any, ...]] = [
-            (pieces.end[done], rank, pieces.ends[done], 1),
-            (pieces.end[done[failed]], rank[failed], pieces.ends[done[failed]], 0),
-            (early[3], 1, -1, np.arange(len(early[3]))),
-            (load.times[released], 1, 0, np.arange(len(released)))]
-        order = np.argsort(sort_by(*np.concatenate(
-            [np.array(np.broadcast_arrays(*key)) for key in keys], axis=1))) + 1
-        completions, failures, ends, releases = np.split(
-            order, np.cumsum([len(key[0]) for key in keys])[:-1])
         completed = np.full(len(pieces.begins), UNKNOWN)
-        completed[done] = completions
-        return (self._releases(released, releases), self._executions(completed),
-                self._job_ends(done[failed], failures, early, ends))
-
-    def _ranks(self, rows: Ints) -> Ints:
-        """Return which ends, by row of the log, come after a start at the same time: 2, else 0."""
-        now, kind = self._log[:2]
-        others = np.r_[np.flatnonzero(kind != END), len(kind)]
-        first = others[np.searchsorted(now[others[:-1]], now[rows])]
-        return np.where((first < rows) & (now[np.minimum(first, len(now) - 1)] == now[rows]), 2, 0)
+        completed[done] = _position(pieces.ends[done])
+        return (self._releases(np.flatnonzero(kind == RELEASE)), self._executions(completed),
+                self._job_ends(done[self._fails(done)], np.flatnonzero(kind == JOB_ENDED)))
 
     def _fails(self, done: Ints) -> Ints:
         """Return which of the completions are failures."""
@@ -221,38 +210,36 @@ class _Tables:
         return np.flatnonzero(load.fates[
             load.cost_base[dag] + pieces.job[done] * load.cost_stride[dag] + local] == FAILS)
 
-    def _early_ends(self) -> Ints:
-        """Return early ends of jobs: DAG, job, reason, time."""
-        kind, dag, _, job, how, time = self._decisions
-        rows = np.flatnonzero(
-            (kind == JOB_END) & np.isin(how, list(_REASONS)) & (dag < self._n_dags))
-        reasons = np.array([_REASONS[each] for each in how[rows].tolist()], dtype=np.int64)
-        return np.array([dag[rows], job[rows], reasons, time[rows]])
-
-    def _releases(self, rows: Ints, order: Ints) -> Table:
-        load = self._load
-        dag, times = load.dags[rows], load.times[rows]
+    def _releases(self, rows: Ints) -> Table:
+        now, _, _, dag, release, job = self._log[:, rows]
         return table_of(
-            tables.RELEASES, len(rows), dag=dag, job=self._numbers(dag, load.jobs[rows]),
-            release=load.releases[rows] if len(load.releases) else times, noticed=times,
-            order=order)
+            tables.RELEASES, len(rows), dag=dag, job=self._numbers(dag, job), release=release,
+            noticed=now, order=_position(rows))
 
-    def _job_ends(self, failed: Ints, failures: Ints, early: Ints, order: Ints) -> Table:
+    def _job_ends(self, failed: Ints, early: Ints) -> Table:
+        """
+        Return the ends of jobs before their last completions.
+
+        :param failed: the pieces that failed; ``early``: the other ends, as rows of the log.
+        """
         pieces = self._pieces
-        dag, job, reason, time = np.concatenate([np.array(np.broadcast_arrays(
-            pieces.dag[failed], pieces.job[failed], tables.FAILED, pieces.end[failed])), early],
-            axis=1)
-        vertex = np.r_[pieces.vertex[failed], np.full(len(early[0]), UNKNOWN)]
+        now, _, _, dag, how, job = self._log[:, early]
+        reason = np.array([_REASONS[each] for each in how.tolist()], dtype=np.int64)
+        dag, job = np.r_[pieces.dag[failed], dag], np.r_[pieces.job[failed], job]
         found = table_of(
-            tables.JOB_ENDS, len(dag), dag=dag, vertex=vertex, job=self._numbers(dag, job),
-            time=time, reason=reason, order=np.r_[failures, order])
+            tables.JOB_ENDS, len(dag), dag=dag,
+            vertex=np.r_[pieces.vertex[failed], np.full(len(early), UNKNOWN)],
+            job=self._numbers(dag, job), time=np.r_[pieces.end[failed], now],
+            reason=np.r_[np.full(len(failed), tables.FAILED), reason],
+            # an execution that fails ends its job before it completes
+            order=np.r_[_position(pieces.ends[failed]) - 1, _position(early)])
         return found[sort_by(found['order'])]
 
     def _executions(self, order: Ints) -> Table:
         """
         Return the executions, in the order of their ends.
 
-        :param order: by piece its position in the order, if it completes a vertex.
+        :param order: by piece its position in the log, if it completes a vertex.
         """
         each = self._pieces
         rows = sort_by(np.where(each.ends >= 0, each.ends, len(self._log[0]) + each.begins))

@@ -103,7 +103,7 @@ class Reschedule:
         """Return the schedule as a computed run."""
         end = self.settings.duration_ns
         return ComputedRun(
-            self.task_set, self.work.load, self.log, self.decisions, end, end, True,
+            self.task_set, self.work.load, self.log, self.decisions, end, True,
             self.work.jobs, self.settings.judge_from, self._run.run.judged_releases)
 
     def result(self) -> RescheduleResult:

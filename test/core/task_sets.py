@@ -60,7 +60,7 @@ class Case:
         for dag in self.task_set.dags:
             first.append(first[-1] + len(dag.vertices))
         return [(time // TICK, KINDS[kind], worker, dag, vertex - first[dag], job)
-                for time, kind, worker, dag, vertex, job in run.log]
+                for time, kind, worker, dag, vertex, job in run.log if kind in KINDS]
 
     def _repr_pretty_(self, printer, cycle):
         """Show in hypothesis' reports what is needed to try it by hand."""

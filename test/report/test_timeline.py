@@ -42,7 +42,7 @@ def test_a_schedule_is_told_as_its_trace_says(settings, utilisation, tmp_path):
     load, run = runs.simulated(task_set, utilisation=utilisation, **settings)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     same_tables(ComputedRun(
-        task_set, load, run.log, run.decisions, 300 * runs.MS, run.ended_ns).recording(),
+        task_set, load, run.log, run.decisions, run.ended_ns).recording(),
         open_recording(tmp_path / 'run.mcap'))
     seen, read = html.of_run(task_set, load, run), html.of_outcome(replay(tmp_path / 'run.mcap'))
     assert seen.replay.tally.result() == read.replay.tally.result() == run.tally.result()
@@ -68,7 +68,7 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path):
     run = simulate(task_set, load, Settings(workers=1, duration_ns=100 * runs.MS), log=True)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     seen = ComputedRun(
-        task_set, load, run.log, run.decisions, 100 * runs.MS, run.ended_ns,
+        task_set, load, run.log, run.decisions, run.ended_ns,
         numbers=[[10 * job for job in range(10)]]).recording()
     assert len(seen.job_ends) > 1
     same_tables(seen, open_recording(tmp_path / 'run.mcap'), 10)

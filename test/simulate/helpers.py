@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Executions of a simulated run."""
 
-from mddag_executor.simulate import START
+from mddag_executor.simulate import END, PREEMPT, START
 
 
 def executions(log):
@@ -12,5 +12,5 @@ def executions(log):
         time, kind, worker, *_ = entry
         if kind == START:
             since[worker] = time
-        else:
+        elif kind in (END, PREEMPT):
             yield since.pop(worker), entry

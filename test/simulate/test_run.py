@@ -10,16 +10,19 @@ import tempfile
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from mddag_executor import replay, reschedule
-from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
+from mddag_executor.core.state import EXPIRED, SINK_COMPLETED, SINK_LATE
 from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.simulate import (
     draw_execution_times,
     END,
+    JOB_ENDED,
     Load,
     periodic_load,
+    RELEASE,
     scale_execution_times,
     Settings,
     simulate,
+    START,
     utilisation,
 )
 from mddag_executor.whatif.run_writer import write_trace
@@ -103,6 +106,19 @@ def test_a_source_may_get_ready_after_its_release():
     assert late.result()['first_miss'] == {
         'dag': 'a', 'vertex': '/n:x@a', 'job': 0, 'deadline_ns': 9 * US + 1,
         'completed_ns': 9 * US + 2}
+
+
+def test_the_log_has_releases_and_early_ends_in_the_order_of_the_engine():
+    """A release expires the job before it; what waits of that job still runs."""
+    task_set = declaration([{'node': '/n', 'name': 't', 'timer': '10us', 'deadline': '9us',
+                             'max_active_jobs': 1, 'execution_time': '25us'}])
+    run = simulate(task_set, periodic_load(task_set, [[25 * US]], 26 * US),
+                   Settings(workers=1, duration_ns=26 * US), log=True)
+    assert [*map(tuple, run.log)] == [
+        (0, RELEASE, -1, 0, 0, 0), (0, START, 0, 0, 0, 0),
+        (10 * US, JOB_ENDED, -1, 0, EXPIRED, 0), (10 * US, RELEASE, -1, 0, 10 * US, 1),
+        (20 * US, JOB_ENDED, -1, 0, EXPIRED, 1), (20 * US, RELEASE, -1, 0, 20 * US, 2),
+        (25 * US, END, 0, 0, 0, 0), (25 * US, START, 0, 0, 0, 1)]
 
 
 def test_a_bound_for_all_dags_and_one_of_its_own():
