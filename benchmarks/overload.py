@@ -25,13 +25,13 @@ from mddag_executor.core.tables import IMPORTANT, ON_LATE
 from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.simulate import (
     draw_execution_times,
-    Load,
-    periodic_load,
+    periodic_workload,
     scale_execution_times,
     Settings,
+    Workload,
 )
+from mddag_executor.simulate.execution_times import with_execution_times
 from mddag_executor.simulate.schedule import prepare, schedule
-from mddag_executor.simulate.workload import with_execution_times
 from msg_graph import loads, TaskSet
 import numpy as np
 
@@ -115,7 +115,7 @@ class _Case:
         n_dags = len(task_set.dags)
         self._important = {*random.Random(seed).sample(range(n_dags), -(-n_dags // 3))}
         self._tables = Tables.build(with_execution_times(task_set, times))
-        load_ = periodic_load(task_set, times, args.duration)
+        load_ = periodic_workload(task_set, times, args.duration)
         if mode.interpreter:
             load_ = load_._replace(holds=[1] * len(load_.costs))
         self._load = load_
@@ -138,7 +138,7 @@ class _Case:
         shares['alone'].append(self._share('rad', 'demote', tables, alone, self._important))
 
     def _share(
-        self, policy: str, on_late: str, tables: Tables, load: Load, dags: Collection[int]
+        self, policy: str, on_late: str, tables: Tables, load: Workload, dags: Collection[int]
     ) -> float:
         """Return the share of the results of some DAGs that are in time."""
         settings = Settings(

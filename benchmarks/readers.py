@@ -21,7 +21,7 @@ from typing import Any
 from mddag_executor.child import run_child
 from mddag_executor.simulate import (
     draw_execution_times,
-    periodic_load,
+    periodic_workload,
     scale_execution_times,
     Settings,
     simulate,
@@ -54,7 +54,7 @@ def write_long_trace(path: str, task_set: TaskSet, events: int) -> None:
         judge='completions')
     times = scale_execution_times(
         task_set, draw_execution_times(task_set, 0), settings.workers, 0.6)
-    load = periodic_load(task_set, times, settings.duration_ns)
+    load = periodic_workload(task_set, times, settings.duration_ns)
     write_trace(path, task_set, load, simulate(task_set, load, settings, log=True))
 
 

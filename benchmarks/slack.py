@@ -45,13 +45,13 @@ def check_slack(
     args: argparse.Namespace, task_set: TaskSet, folder: str, record: Record
 ) -> dict[str, Any]:
     """Return the result of `replay --slack`."""
-    from mddag_executor.simulate import draw_execution_times, periodic_load, Settings
+    from mddag_executor.simulate import draw_execution_times, periodic_workload, Settings
     from mddag_executor.whatif.slack import find_slack, NOTHING, Problem
     from msg_graph import loads
     times = _times(task_set, args.utilisation[0], args.workers[0])
     fixed = loads(with_times(task_set, times), task_set.file)
     settings = Settings(workers=args.workers[0])
-    load = periodic_load(fixed, draw_execution_times(fixed, 0), settings.duration_ns)
+    load = periodic_workload(fixed, draw_execution_times(fixed, 0), settings.duration_ns)
     with Progress('recording', 2 * args.callbacks) as line:
         slack = find_slack(Problem(
             load, settings, Tables.build(fixed), fixed.places_of_vertices()), jobs=processors())

@@ -34,9 +34,9 @@ from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment, judge_of
 from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.simulate import END
-from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.execution_times import draw_execution_times
 from mddag_executor.simulate.schedule import schedule, Settings
-from mddag_executor.simulate.workload import draw_execution_times, periodic_load
+from mddag_executor.simulate.workload import periodic_workload, Workload
 from msg_graph import loads, TaskSet
 import numpy as np
 
@@ -118,7 +118,7 @@ def time_core(
     """
     settings = Settings(policy, workers, duration_ns, preemptive=None)
     tables = Tables.build(task_set)
-    load = periodic_load(task_set, draw_execution_times(task_set, seed), duration_ns)
+    load = periodic_workload(task_set, draw_execution_times(task_set, seed), duration_ns)
 
     def simulate() -> None:
         schedule(tables, load, settings)
@@ -158,7 +158,7 @@ def _seconds(work: Callable[[], object], repeat: int) -> float:
     return median(taken)
 
 
-def drive_live(tables: Tables, policy: str, load: Load) -> int:
+def drive_live(tables: Tables, policy: str, load: Workload) -> int:
     """
     Make the core's calls of a live run: jobs with the same release together, until they end.
 

@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
     workers = defaults.workers(args.workers, task_set)
     result = check_result(task_set, workers, args.budget)
     if args.fail_on_unschedulable:
-        from mddag_executor.simulate.workload import check_execution_times
+        from mddag_executor.simulate.execution_times import check_execution_times
         check_execution_times(task_set)
     tests = result['tests']
     warn(*_warnings(task_set, result))

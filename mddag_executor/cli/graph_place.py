@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     from mddag_executor.laboratory.placement import Placing
-    from mddag_executor.simulate.workload import check_execution_times
+    from mddag_executor.simulate.execution_times import check_execution_times
     from msg_graph.edit import with_processes
     from msg_graph.model import mean_execution_times
     task_set = common.load_graph(args.graph)

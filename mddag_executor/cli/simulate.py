@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    from mddag_executor.simulate import periodic_load, Settings, simulate, utilisation
+    from mddag_executor.simulate import periodic_workload, Settings, simulate, utilisation
     task_set = common.load_graph(args.graph)
     workers = defaults.workers(args.workers, task_set)
     times = execution_times(args, task_set, workers)
@@ -51,7 +51,7 @@ def main(args: argparse.Namespace) -> int:
         policy=args.policy, on_late=args.on_late, workers=workers, duration_ns=args.duration,
         preemptive=bool(args.preemptive), judge=args.judge,
         stop_at_first_miss=args.stop_at_first_miss, cpus=args.cpus)
-    load = periodic_load(task_set, times, args.duration)
+    load = periodic_workload(task_set, times, args.duration)
     required = any(path.requirements for path in task_set.paths)
     with Progress('simulating', settings.duration_ns) as line:
         run = simulate(

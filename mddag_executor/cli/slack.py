@@ -110,7 +110,7 @@ def _of_graph(
     args: argparse.Namespace,
 ) -> tuple[Problem, TaskSet, dict[str, DagCounts], Requirements]:
     from mddag_executor.core import Tables
-    from mddag_executor.simulate import periodic_load, Settings
+    from mddag_executor.simulate import periodic_workload, Settings
     from mddag_executor.simulate import simulate as simulated
     from mddag_executor.whatif.computed import ComputedRun
     from mddag_executor.whatif.slack import Problem
@@ -127,7 +127,7 @@ def _of_graph(
         policy=args.policy or 'rad', workers=workers,
         duration_ns=args.duration or defaults.DURATION_NS, preemptive=bool(args.preemptive),
         cpus=args.cpus)
-    load = periodic_load(task_set, times, settings.duration_ns)
+    load = periodic_workload(task_set, times, settings.duration_ns)
     requires = any(path.requirements for path in task_set.paths)
     run = simulated(task_set, load, settings, log=requires)
     problem = Problem(load, settings, Tables.build(task_set), task_set.places_of_vertices())

@@ -35,7 +35,7 @@ from mddag_executor.hosting.run_result import RunResult
 from mddag_executor.hosting.signals import Signals
 from mddag_executor.laboratory.placement import packed
 from mddag_executor.output_rules import check_output, remove_recording
-from mddag_executor.simulate.workload import draw_execution_times
+from mddag_executor.simulate.execution_times import draw_execution_times
 from mddag_executor.synthetic.measure import ExecutionPlan
 from msg_graph import TaskSet
 from msg_graph.edit import with_processes

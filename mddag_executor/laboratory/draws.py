@@ -25,7 +25,7 @@ import zlib
 
 from mddag_executor.core import rad_offsets
 from mddag_executor.errors import InputError
-from mddag_executor.simulate.workload import check_execution_times
+from mddag_executor.simulate.execution_times import check_execution_times
 from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.duration import DAY
 from msg_graph.model import topological_order

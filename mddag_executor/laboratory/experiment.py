@@ -37,7 +37,7 @@ from mddag_executor.laboratory.draws import (
 )
 from mddag_executor.simulate.policies import preempts
 from mddag_executor.simulate.schedule import schedule, Settings
-from mddag_executor.simulate.workload import periodic_load
+from mddag_executor.simulate.workload import periodic_workload
 from msg_graph import TaskSet
 import numpy as np
 
@@ -98,17 +98,17 @@ Judge = Callable[[Settings, Times], Bools]
 def judge_of(task_set: TaskSet, duration_ns: int, compiled: bool) -> Judge:
     """Return the function that simulates runs of a task set, each up to its first miss."""
     tables = Tables.build(task_set)
-    load = periodic_load(
+    load = periodic_workload(
         task_set, [[0] * len(dag.vertices) for dag in task_set.dags], duration_ns)
     if compiled:
         from mddag_executor.simulate.compiled import run_each
 
     def judge(settings: Settings, times: Times) -> Bools:
         if compiled:
-            orders = settings.orders._replace(keep_log=0)
+            options = settings.engine_options._replace(keep_log=0)
             _, missed = run_each(
                 tables, load._replace(costs=times.ravel()),  # type: ignore[arg-type]
-                settings.policy, orders, len(times))
+                settings.policy, options, len(times))
             return np.logical_not(missed)
         return np.array([not any(is_miss(kind) for kind, *_ in schedule(
             tables, load._replace(costs=costs), settings, compiled=False).decisions)

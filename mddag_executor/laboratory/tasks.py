@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from mddag_executor import defaults
 from mddag_executor.core.tables import leaf_deadline
 from mddag_executor.errors import UsageError
-from mddag_executor.simulate.workload import check_execution_times
+from mddag_executor.simulate.execution_times import check_execution_times
 from msg_graph import Dag, ExecutionTime, TaskSet
 from msg_graph.model import path_lengths, topological_order
 

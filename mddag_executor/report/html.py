@@ -41,7 +41,7 @@ from mddag_executor.report.tables import (
 )
 from mddag_executor.report.text import format_ns, printable
 from mddag_executor.report.timeline import Timeline
-from mddag_executor.simulate import Load, SimulatedRun
+from mddag_executor.simulate import SimulatedRun, Workload
 from mddag_executor.text import counted
 from mddag_executor.whatif.computed import ComputedRun
 from mddag_executor.whatif.reschedule import Reschedule
@@ -79,7 +79,7 @@ def of_outcome(
                          worker_names=outcome.worker_names)
 
 
-def of_run(task_set: TaskSet, load: Load, run: SimulatedRun) -> ReportData:
+def of_run(task_set: TaskSet, load: Workload, run: SimulatedRun) -> ReportData:
     """Return the data of a report about a run that was simulated with its log."""
     replay = Replay(ComputedRun.of_run(task_set, load, run).recording(run.settings.workers))
     result = {**run.result(), 'requirements': replay.requirements.result()}

@@ -22,7 +22,7 @@ from bisect import bisect_left
 from functools import cache
 
 from mddag_executor.core import NEVER, quantile, Tables
-from mddag_executor.simulate.load import as_lists, edge_numbers, Load, needs_python
+from mddag_executor.simulate.workload import as_lists, edge_numbers, needs_python, Workload
 
 
 class Durations:
@@ -32,7 +32,7 @@ class Durations:
     :ivar recorded: whether the load is recorded; if not, messages take no time.
     """
 
-    def __init__(self, tables: Tables, load: Load, recorded: bool) -> None:
+    def __init__(self, tables: Tables, load: Workload, recorded: bool) -> None:
         self.recorded = recorded
         self._tables = tables
         self._load = load = as_lists(load)

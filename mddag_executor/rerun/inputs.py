@@ -23,7 +23,7 @@ from mddag_executor.output_rules import is_recording
 from mddag_executor.recording.recording import Recording
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import RerunError
-from mddag_executor.simulate import draw_execution_times, periodic_load, read_execution_times
+from mddag_executor.simulate import draw_execution_times, periodic_workload, read_execution_times
 from mddag_executor.sources.bags import Bag
 from mddag_executor.sources.kinds import is_ordinary
 from mddag_executor.sources.open import open_recording
@@ -154,7 +154,7 @@ def open_input(
 
 
 def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
-    return Durations(Tables.build(task_set), periodic_load(task_set, times, 1), recorded=False)
+    return Durations(Tables.build(task_set), periodic_workload(task_set, times, 1), recorded=False)
 
 
 def _recorded(run: Recording, task_set: TaskSet) -> Durations:

@@ -42,13 +42,13 @@ from mddag_executor.core import jobs, overload, policies, queues, rules, state, 
 from mddag_executor.core.state import Decision, State
 from mddag_executor.core.tables import Tables
 from mddag_executor.errors import UsageError
-from mddag_executor.simulate import deliveries, dispatch, engine, load, machine, polling, pool
+from mddag_executor.simulate import deliveries, dispatch, engine, machine, polling, pool, workload
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import Orders
-from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.engine import EngineOptions
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.policies import ALL_POLICIES
 from mddag_executor.simulate.pool import LogEntry, Pool
+from mddag_executor.simulate.workload import Workload
 import numpy as np
 import numpy.typing as npt
 
@@ -56,12 +56,12 @@ _COMPILE_S = 20.0   # approximate compile time
 _REPEATS = 4        # assumed repetitions of such work, as with other settings
 
 _MODULES = (
-    tables, state, queues, jobs, overload, policies, rules, load, pool, polling, dispatch, machine,
-    deliveries, engine)
+    tables, state, queues, jobs, overload, policies, rules, workload, pool, polling, dispatch,
+    machine, deliveries, engine)
 _NOT_COMPILED = frozenset({
     # for plain lists
     'empty', 'as_object', 'add_heap', 'rad_offsets', 'reached_sinks', 'mean_time',
-    'policy', 'find', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers'})
+    'policy', 'find', 'as_arrays', 'as_lists', 'edges_of', 'edge_numbers', 'periodic_workload'})
 ENTRY_POINTS = ('free_run', 'run_each')
 PARTS = (
     # called for each execution
@@ -189,8 +189,8 @@ def _is_compiled() -> bool:
 def prepare() -> None:
     """Compile the core, or load it from disk, with a call that runs nothing."""
     with _interruptible():
-        run_each(Tables.build(None), Load([], [], [], [], [], []), 'rad',
-                 Orders(*[0] * len(Orders._fields)))
+        run_each(Tables.build(None), Workload([], [], [], [], [], []), 'rad',
+                 EngineOptions(*[0] * len(EngineOptions._fields)))
 
 
 @contextmanager
@@ -218,18 +218,18 @@ def _interruptible() -> Iterator[None]:
 
 
 def run_each(
-    tables: Tables, load: Load, policy: str, orders: Orders, runs: int = 1,
+    tables: Tables, load: Workload, policy: str, options: EngineOptions, runs: int = 1,
 ) -> tuple[tuple[int, Sequence[LogEntry], Sequence[Decision], list[int]], list[int]]:
     """
     Run a load like ``engine.run``, once or several times.
 
-    :param runs: number of runs; each has the next row of execution times in ``Load.costs``, which
-        has one for each vertex.
+    :param runs: number of runs; each has the next row of execution times in ``Workload.costs``,
+        which has one for each vertex.
     :return: the end, the log of every worker, the decisions, the busy time of each worker, all of
         the last run; and by run 1 if a deadline was missed, otherwise 0.
     """
     load = load._replace(cost_base=[*load.cost_base])   # is changed
-    lent = [Memory(*tables, list(ALL_POLICIES).index(policy)), Memory(*load), Memory(*orders)]
+    lent = [Memory(*tables, list(ALL_POLICIES).index(policy)), Memory(*load), Memory(*options)]
     missed = Memory(np.zeros(runs))
     core, workers, *_ = working = [
         Memory(*[0] * len(fields)) for fields in (

@@ -26,8 +26,8 @@ from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.rules import complete, fail, satisfy_edge
 from mddag_executor.core.state import OPEN, QueueEntry, State
 from mddag_executor.core.tables import NEVER, Tables
-from mddag_executor.simulate.load import FAILS, Load, place_of
 from mddag_executor.simulate.machine import is_used, Machine, progress
+from mddag_executor.simulate.workload import FAILS, place_of, Workload
 
 # Columns of ``Deliveries.scalars``.
 SENT, MAY_PREEMPT = range(2)
@@ -57,7 +57,7 @@ def next_arrival(d: Deliveries) -> int:
     return d.messages[0][0] if len(d.messages) > 0 else NEVER
 
 
-def delay_of(t: Tables, s: State, load: Load, x: int, edge: int) -> int:
+def delay_of(t: Tables, s: State, load: Workload, x: int, edge: int) -> int:
     """Return how long after the end of an execution an edge of its vertex is satisfied."""
     slot = s.x_slot[x]
     dag = s.job_dag[slot]
@@ -66,7 +66,7 @@ def delay_of(t: Tables, s: State, load: Load, x: int, edge: int) -> int:
 
 
 def sends_at_start(
-    t: Tables, s: State, load: Load, d: Deliveries, m: Machine, x: int, now: int
+    t: Tables, s: State, load: Workload, d: Deliveries, m: Machine, x: int, now: int
 ) -> None:
     """Send the messages of a started execution, as far as their times are known."""
     vertex = s.x_vertex[x]
@@ -87,7 +87,7 @@ def sends_at_start(
 
 
 def _find_next_place(
-    t: Tables, s: State, load: Load, d: Deliveries, m: Machine, x: int
+    t: Tables, s: State, load: Workload, d: Deliveries, m: Machine, x: int
 ) -> None:
     """Find the next publication of an execution before its end, and its place."""
     vertex = s.x_vertex[x]
@@ -105,7 +105,7 @@ def _find_next_place(
 
 
 def ends_sending(
-    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine, x: int,
+    t: Tables, s: State, key: KeyFunction, load: Workload, d: Deliveries, m: Machine, x: int,
     now: int,
 ) -> None:
     """End an execution, and send its messages."""
@@ -129,7 +129,7 @@ def ends_sending(
             _post(s, d, now + delay, x, t.successors[edge])
 
 
-def _withhold_unsent(t: Tables, s: State, load: Load, x: int, now: int) -> None:
+def _withhold_unsent(t: Tables, s: State, load: Workload, x: int, now: int) -> None:
     """Leave out of a job what an execution that ends might have started, but has not."""
     vertex = s.x_vertex[x]
     for edge in range(t.first_successor[vertex], t.first_successor[vertex + 1]):
@@ -138,7 +138,7 @@ def _withhold_unsent(t: Tables, s: State, load: Load, x: int, now: int) -> None:
 
 
 def arrive_due(
-    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine, now: int
+    t: Tables, s: State, key: KeyFunction, load: Workload, d: Deliveries, m: Machine, now: int
 ) -> None:
     """Satisfy the edges whose messages arrive now, in the order of sending."""
     while len(d.messages) > 0 and d.messages[0][0] <= now:
@@ -154,7 +154,8 @@ def arrive_due(
 
 
 def _publish_next(
-    t: Tables, s: State, key: KeyFunction, load: Load, d: Deliveries, m: Machine, x: int, now: int
+    t: Tables, s: State, key: KeyFunction, load: Workload, d: Deliveries, m: Machine, x: int,
+    now: int,
 ) -> None:
     slot, after = s.x_slot[x], d.next_vertex[x]
     _find_next_place(t, s, load, d, m, x)

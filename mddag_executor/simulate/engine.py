@@ -48,7 +48,6 @@ from mddag_executor.simulate.deliveries import (
     sends_at_start,
 )
 from mddag_executor.simulate.dispatch import dispatch
-from mddag_executor.simulate.load import Load, needs_python, SKIPPED
 from mddag_executor.simulate.machine import (
     decide,
     fill_machine,
@@ -69,9 +68,10 @@ from mddag_executor.simulate.pool import (
     RELEASE,
     START,
 )
+from mddag_executor.simulate.workload import needs_python, SKIPPED, Workload
 
 
-class Orders(NamedTuple):
+class EngineOptions(NamedTuple):
     """How to run a load, as integers: see ``schedule.Settings``."""
 
     workers: int
@@ -91,15 +91,15 @@ class Orders(NamedTuple):
 
 
 def run(
-    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Load,
-    o: Orders, progress: Callable[[int], None] | None,
+    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Workload,
+    o: EngineOptions, progress: Callable[[int], None] | None,
 ) -> int:
     """
     Run the core over a load, with an empty state, pool, …; return the end, ns.
 
     Decisions are in ``s.decisions``, busy times and log in the pool.  With
-    ``Orders.stop_at_first_miss`` the run ends with the instant at which the first miss is known: a
-    late completion, or an early end of a job.
+    ``EngineOptions.stop_at_first_miss`` the run ends with the instant at which the first miss is
+    known: a late completion, or an early end of a job.
 
     :param progress: receives the virtual time at each event.
     """
@@ -163,7 +163,7 @@ def run(
 
 
 def _fill(
-    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, load: Load, o: Orders
+    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, load: Workload, o: EngineOptions
 ) -> None:
     """Fill the columns of an empty state, and of deliveries and machine if the load needs them."""
     sends = len(load.delay_base) > 0
@@ -186,7 +186,8 @@ def _fill(
 
 
 def release_load(
-    t: Tables, s: State, p: Pool, key: KeyFunction, load: Load, o: Orders, i: int, now: int
+    t: Tables, s: State, p: Pool, key: KeyFunction, load: Workload, o: EngineOptions, i: int,
+    now: int,
 ) -> None:
     """Release the i-th job of a load, with its execution times."""
     dag = load.dags[i]
@@ -224,8 +225,8 @@ def release_load(
 
 
 def _dispatch(
-    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Load,
-    o: Orders, now: int,
+    t: Tables, s: State, p: Pool, d: Deliveries, m: Machine, key: KeyFunction, load: Workload,
+    o: EngineOptions, now: int,
 ) -> None:
     """Dispatch executions; ``Pool.running`` has the preempted ones for the log."""
     sends, stops = len(load.delay_base) > 0, is_used(m)

@@ -18,12 +18,12 @@ from mddag_executor.core.policies import Key
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import Tables
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import any_missed, Orders, run
-from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.engine import any_missed, EngineOptions, run
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.policies import ALL_POLICIES
 from mddag_executor.simulate.pool import Pool
 from mddag_executor.simulate.vectors import at, free, StructureType, VectorType
+from mddag_executor.simulate.workload import Workload
 from numba import extending, types
 
 _KINDS = {
@@ -48,17 +48,17 @@ def _structure(row: Any, **more: Any) -> Any:
 KINDS: dict[str, Any] = {
     **_KINDS, 'Tables': _structure(Tables, policy=types.int64),
     **{row.__name__: _structure(row)
-       for row in (State, Pool, Load, Deliveries, Machine, Orders)}}
+       for row in (State, Pool, Workload, Deliveries, Machine, EngineOptions)}}
 """The types of compiled code, by the annotations of the source."""
 
 # Functions for compiled code that turn an address into a structure or vector.
 as_tables = at(KINDS['Tables'])
 as_state = at(KINDS['State'])
 as_pool = at(KINDS['Pool'])
-as_load = at(KINDS['Load'])
+as_load = at(KINDS['Workload'])
 as_deliveries = at(KINDS['Deliveries'])
 as_machine = at(KINDS['Machine'])
-as_orders = at(KINDS['Orders'])
+as_options = at(KINDS['EngineOptions'])
 as_vector = at(VectorType())
 STATE_FIELDS = len(State._fields)
 POOL_FIELDS = len(Pool._fields)
@@ -91,7 +91,7 @@ def bind_policies(space: dict[str, Any]) -> None:
 
 
 def run_each(
-    tables: int, load: int, orders: int, state: int, pool: int, deliveries: int, machine: int,
+    tables: int, load: int, options: int, state: int, pool: int, deliveries: int, machine: int,
     missed: int,
 ) -> int:
     """
@@ -110,7 +110,7 @@ def run_each(
                 rows.cost_base[dag] += t.n_vertices
         ended = run(
             t, s, as_pool(pool), as_deliveries(deliveries), as_machine(machine), key_of_policy,
-            rows, as_orders(orders), None)
+            rows, as_options(options), None)
         misses[number] = int(any_missed(s, 0))
     return ended
 

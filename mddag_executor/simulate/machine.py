@@ -35,8 +35,8 @@ from typing import NamedTuple
 from mddag_executor.core.queues import overtaking_pays, overtaking_pays_from
 from mddag_executor.core.state import add_heap, N_HOLDING, State
 from mddag_executor.core.tables import NEVER, Tables
-from mddag_executor.simulate.load import Load, place_of
 from mddag_executor.simulate.pool import first_to_run, Pool, PREEMPTIVE
+from mddag_executor.simulate.workload import place_of, Workload
 
 SWITCH_NS = 1_000_000
 """Python's switch interval while an executor spins."""
@@ -141,7 +141,7 @@ def decide(t: Tables, s: State, p: Pool, m: Machine, now: int) -> None:
                     m.scalars[OVERTAKE_AT] = pays_at
 
 
-def starts(s: State, load: Load, m: Machine, x: int, now: int) -> None:
+def starts(s: State, load: Workload, m: Machine, x: int, now: int) -> None:
     """Note that an execution has been dispatched."""
     cost = s.x_cost[x]
     begins(s, m, x, cost, load.computed[place_of(s, load, x)] if len(load.computed) > 0 else cost)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core.state import Decision
 from mddag_executor.errors import UsageError
-from mddag_executor.simulate.load import Load
 from mddag_executor.simulate.pool import LogEntry
 from mddag_executor.simulate.schedule import schedule, Settings
+from mddag_executor.simulate.workload import Workload
 from msg_graph import TaskSet
 from msg_graph.model import MOST_WORKERS
 
@@ -52,7 +52,7 @@ class SimulatedRun:
 
 def simulate(
     task_set: TaskSet,
-    load: Load,
+    load: Workload,
     settings: Settings,
     *,
     utilisation: float | None = None,

@@ -20,12 +20,12 @@ from mddag_executor.core.state import (
     State,
 )
 from mddag_executor.simulate.deliveries import Deliveries
-from mddag_executor.simulate.engine import Orders, run
-from mddag_executor.simulate.load import as_list, as_lists, Load
+from mddag_executor.simulate.engine import EngineOptions, run
 from mddag_executor.simulate.machine import Machine
 from mddag_executor.simulate.policies import policy as find_policy
 from mddag_executor.simulate.policies import preempts, ROS2
 from mddag_executor.simulate.pool import LogEntry, Pool
+from mddag_executor.simulate.workload import as_list, as_lists, Workload
 
 # Approximate time of plain Python per execution, without and with a machine, to choose the faster.
 PLAIN_S, _STOPS_S = 10e-6, 50e-6
@@ -72,9 +72,9 @@ class Settings:
         return preempts(self.policy, self.preemptive, self.processes)
 
     @property
-    def orders(self) -> Orders:
+    def engine_options(self) -> EngineOptions:
         """Return the settings as integers for the engine; raise like ``preempts``."""
-        return Orders(
+        return EngineOptions(
             self.workers, self.processes, int(self.preempts),
             int(self.policy == ROS2), find_policy(self.policy).urgency,
             self.dispatch_overhead_ns,
@@ -95,7 +95,7 @@ class Scheduled(NamedTuple):
     decisions: Sequence[Decision]
     busy: list[int]
 
-    def count_into(self, tally: Tally, load: Load, settings: Settings) -> None:
+    def count_into(self, tally: Tally, load: Workload, settings: Settings) -> None:
         """
         Count the judged jobs that were released, and the decisions, in an empty tally.
 
@@ -113,7 +113,7 @@ class Scheduled(NamedTuple):
         tally.add(self.decisions)
 
     def _count_columns(
-        self, tally: Tally, load: Load, releases: Sequence[int], settings: Settings
+        self, tally: Tally, load: Workload, releases: Sequence[int], settings: Settings
     ) -> None:
         """Count the jobs and decisions of a compiled run."""
         import numpy as np
@@ -136,7 +136,7 @@ class Scheduled(NamedTuple):
 
 
 def schedule(
-    tables: Tables, load: Load, settings: Settings, *, log: bool = False,
+    tables: Tables, load: Workload, settings: Settings, *, log: bool = False,
     progress: Callable[[int], None] | None = None, compiled: bool | None = None,
 ) -> Scheduled:
     """
@@ -146,21 +146,21 @@ def schedule(
     :param progress: receives the virtual time (ns) regularly, from plain Python only.
     :param compiled: whether to use the compiled core; None: if that is faster.
     """
-    orders = settings.orders._replace(keep_log=int(log))
+    options = settings.engine_options._replace(keep_log=int(log))
     if compiled is None:
         compiled = prepare(tables, load, settings)
     if compiled:
         from mddag_executor.simulate.compiled import run_each
-        return Scheduled(*run_each(tables, load, settings.policy, orders)[0])
+        return Scheduled(*run_each(tables, load, settings.policy, options)[0])
     state = as_object(empty(State))
     pool = empty(Pool)
     ended = run(
         as_object(tables), state, pool, empty(Deliveries), empty(Machine),
-        find_policy(settings.policy).key, as_lists(load), orders, progress)
+        find_policy(settings.policy).key, as_lists(load), options, progress)
     return Scheduled(ended, pool.log, state.decisions, pool.busy)
 
 
-def prepare(tables: Tables, load: Load, settings: Settings, runs: int = 1) -> bool:
+def prepare(tables: Tables, load: Workload, settings: Settings, runs: int = 1) -> bool:
     """Return whether ``runs`` runs are faster compiled; if so, compile, or load the code."""
     executions = runs * len(load.times) * max(1, tables.n_vertices // max(1, tables.n_dags))
     stops = len(load.holds) > 0 or settings.cpus is not None

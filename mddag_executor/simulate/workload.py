@@ -1,170 +1,117 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""
-The input of one simulated run: an execution time for each vertex, and the releases.
-
-Execution times are a list for each DAG, by local vertex index, in ns: each vertex has one for the
-whole run, as in the paper's experiment. (``draws`` has those of many runs, as arrays.)
-"""
+"""The workload of a run in virtual time: releases, and the properties of their executions."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from itertools import accumulate
-import json
-import math
-import random
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from mddag_executor.core import processes_of
-from mddag_executor.errors import InputError, UsageError
-from mddag_executor.simulate.load import Load
-from mddag_executor.text import counted
-from msg_graph import Dag, ExecutionTime, TaskSet, Vertex
-from msg_graph.duration import DAY, MICROSECOND
+from mddag_executor.core.state import State
+from mddag_executor.core.tables import processes_of, Tables
+from msg_graph import TaskSet
 
-_FORMAT = 'write {"DAG": {"/node:callback": microseconds}}'
-_LONGEST_US = DAY // MICROSECOND
+# The fate of an execution: it runs, fails at its end, or does not run and its job expires.
+RUNS, FAILS, SKIPPED = range(3)
 
 
-def check_execution_times(task_set: TaskSet, otherwise: str = '') -> None:
+class Workload(NamedTuple):
     """
-    Check that each callback declares an execution time.
+    Releases in order of (time, DAG), with the indices and execution times of their jobs.
 
-    :param otherwise: what else to do about it, as ``, or give --execution-times FILE.npz``.
-    :raises InputError: it names the first one that does not.
+    Times are in ns.  The execution time of vertex v in job k of DAG d is ``costs[cost_base[d] + k
+    * cost_stride[d] + local index of v]``: a stride of zero gives every job the same times, the
+    number of vertices of the DAG a row for each job.  The other columns are indexed like
+    ``costs``, and may be empty:
+
+    * ``releases``: by release, if a source becomes ready later (``times``) than it is released;
+    * ``holds``: the interpreter that an execution holds (from 1; 0: none);
+    * ``computed``: its CPU time; -1: it only waits, as far as is known.  Empty: it computes all
+      the time;
+    * ``fates``: its fate (``RUNS``, …; ``SKIPPED`` only at a source).
+
+    ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
+    edge e in job k of DAG d is satisfied (see ``deliveries``); the edges of a DAG are numbered as
+    in ``Tables.successors``, from its first vertex on.
     """
-    missing = [each for each in task_set.callbacks if each.execution_time is None]
-    if missing:
-        others = f' (and {counted(len(missing) - 1, "more callback")})' if missing[1:] else ''
-        raise InputError(
-            missing[0].file or task_set.file,
-            f'{missing[0].key}{others} declares no execution_time', f'add one{otherwise}',
-            missing[0].line)
+
+    times: list[int]
+    dags: list[int]
+    jobs: list[int]
+    costs: list[int]
+    cost_base: list[int]
+    cost_stride: list[int]
+    releases: list[int] = []
+    holds: list[int] = []
+    computed: list[int] = []
+    fates: list[int] = []
+    delays: list[int] = []
+    delay_base: list[int] = []
+    delay_stride: list[int] = []
 
 
-def draw_execution_times(
-    task_set: TaskSet, seed: int, undeclared: int | None = None
-) -> list[list[int]]:
-    """
-    Draw one execution time (ns) for each vertex, for the whole run, as in the paper.
-
-    :param undeclared: execution time of callbacks that declare none, ns; None: each must declare
-        one.
-    :return: one list for each DAG, by local vertex index; the same seed gives the same draw.
-    :raises InputError: if a callback declares no execution time.
-    """
-    if undeclared is None:
-        check_execution_times(task_set, ', or give --execution-times FILE')
-    generator = random.Random(seed)
-
-    def draw(vertex: Vertex) -> int:
-        # Drawn even if nothing is declared: then declaring one more time changes no other draw.
-        share = generator.random()
-        time = vertex.callback.execution_time
-        return undeclared or 0 if time is None else time.draw(share)
-
-    return [[draw(vertex) for vertex in dag.vertices] for dag in task_set.dags]
+Arrays = TypeVar('Arrays', Workload, Tables)
 
 
-def read_execution_times(
-    task_set: TaskSet, text: str | bytes, name: str
-) -> list[list[int]]:
-    """
-    Read fixed execution times: JSON ``{"DAG": {"/node:callback": microseconds, …}, …}``.
-
-    :return: ns, one list for each DAG, by local vertex index.
-    :raises InputError: for any other contents, or a vertex without a time.
-    """
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:  # also bytes that are not text
-        raise InputError(
-            name, f'not usable JSON ({error})', _FORMAT, getattr(error, 'lineno', None)) from None
-    if not isinstance(data, dict) or not all(isinstance(v, dict) for v in data.values()):
-        raise InputError(name, 'not an object of objects', _FORMAT)
-    known = {dag.name for dag in task_set.dags}
-    for dag_name in data:
-        if dag_name not in known:
-            raise InputError(name, f"DAG '{dag_name}' is not in {task_set.file}",
-                             f"its DAGs are {', '.join(sorted(known))}")
-    return [_dag_times(dag, data.get(dag.name, {}), name) for dag in task_set.dags]
+def as_lists(load: Workload) -> Workload:
+    """Return a load whose columns are lists, not arrays."""
+    return Workload(*map(as_list, load))
 
 
-def _dag_times(dag: Dag, times: Mapping[str, Any], name: str) -> list[int]:
-    row = []
-    names: set[str] = set()
-    for vertex in dag.vertices:
-        names.update((vertex.name, vertex.callback.key))
-        value = times.get(vertex.name, times.get(vertex.callback.key))
-        if value is None:
-            raise InputError(
-                name, f'no execution time for {vertex.callback.key} of DAG {dag.name}', 'add it')
-        if isinstance(value, bool) or not isinstance(value, (int, float)) \
-                or not 0 < value < _LONGEST_US:
-            raise InputError(
-                name, f'execution time of {vertex.callback.key} of DAG {dag.name} is '
-                f'{_shown(value)}', 'give microseconds, above 0 and below one day')
-        row.append(max(1, round(value * 1000)))
-    for key in times:
-        if key not in names:
-            raise InputError(name, f"'{key}' is not a vertex of DAG {dag.name}",
-                             'take it out or correct it')
-    return row
+def as_list(column: Any) -> list[int]:
+    """Return a column as a list of Python's integers."""
+    values: list[int] = column if isinstance(column, list) else column.tolist()
+    return values
 
 
-def _shown(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else text[:37] + '...'
+def as_arrays(columns: Arrays) -> Arrays:
+    """Return a load or tables whose columns are arrays, which are faster to change and to pass."""
+    import numpy as np
+    arrays: list[Any] = [
+        column if isinstance(column, int) else np.array(column, dtype=np.int64)
+        for column in columns]
+    return type(columns)(*arrays)
 
 
-def utilisation(task_set: TaskSet, times: Sequence[Sequence[int]], workers: int) -> float:
-    """Return the normalised utilisation: sum of execution time over period, by workers."""
-    total = sum(sum(row) / dag.period_ns for dag, row in zip(task_set.dags, times)
-                if not dag.once)
-    return total / workers
+def needs_python(load: Workload) -> bool:
+    """Return whether executions that do not hold the interpreter need the GIL at their end."""
+    return len(load.computed) > 0 and len(load.holds) > 0
 
 
-def scale_execution_times(
-    task_set: TaskSet, times: Sequence[Sequence[int]], workers: int, target: float
-) -> list[list[int]]:
-    """
-    Return the execution times scaled by one factor to a normalised utilisation, ns.
-
-    :raises UsageError: if the target is not a positive number, or there is nothing to scale.
-    """
-    now = utilisation(task_set, times, workers)
-    if not (target > 0 and math.isfinite(target)):
-        raise UsageError(
-            f'utilisation {target}: it is not a number above zero: give one, as 0.6')
-    if now == 0:
-        raise UsageError(
-            f'{task_set.file}: no callback has an execution time, so there is nothing to scale: '
-            'declare execution_time, or leave the utilisation out')
-    factor = target / now
-    return [[round(time * factor) for time in row] for row in times]
+def place_of(s: State, load: Workload, x: int) -> int:
+    """Return the index of an execution in ``load.costs``."""
+    slot = s.x_slot[x]
+    dag = s.job_dag[slot]
+    return (load.cost_base[dag] + s.job_index[slot] * load.cost_stride[dag]
+            + x - s.job_base[slot])
 
 
-def with_execution_times(task_set: TaskSet, times: Sequence[Sequence[int]]) -> TaskSet:
-    """Return a task set whose vertices declare these execution times, ns."""
-    return replace(task_set, dags=tuple(
-        replace(dag, vertices=tuple(
-            replace(vertex, callback=replace(
-                vertex.callback, execution_time=ExecutionTime((time,), (50.0,))))
-            for vertex, time in zip(dag.vertices, row)))
-        for dag, row in zip(task_set.dags, times)))
+def edges_of(tables: Tables) -> list[int]:
+    """Return the number of edges of each declared DAG."""
+    first = [tables.first_successor[v] for v in tables.first_vertex]
+    return [after - before for before, after in zip(first, first[1:])]
 
 
-def periodic_load(task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns: int) -> Load:
-    """Return the load of releases at k*T from 0, with the same execution times in each job."""
+def edge_numbers(tables: Tables) -> dict[tuple[int, int], int]:
+    """Return the number of each edge in its DAG, by the global vertices that it joins."""
+    first = tables.first_successor
+    return {
+        (vertex, tables.successors[i]): i - first[tables.first_vertex[tables.dag_of[vertex]]]
+        for vertex in range(tables.n_vertices) for i in range(first[vertex], first[vertex + 1])}
+
+
+def periodic_workload(
+    task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns: int
+) -> Workload:
+    """Return the workload of releases at k*T from 0, with the same execution times in each job."""
     releases = sorted(
         (job * dag.period_ns, dag.index, job)
         for dag in task_set.dags
         for job in range(dag.jobs_in(duration_ns)))
     holds = [number * int(vertex.callback.holds_interpreter or False)
              for number, vertex in zip(processes_of(task_set), task_set.vertices)]
-    return Load(
+    return Workload(
         [each[0] for each in releases], [each[1] for each in releases],
         [each[2] for each in releases], costs=[time for row in times for time in row],
         cost_base=list(accumulate(map(len, times), initial=0))[:-1],

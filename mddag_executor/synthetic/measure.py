@@ -37,8 +37,8 @@ from typing import Any, Literal, NamedTuple
 
 from mddag_executor.clocks import epoch_offset_ns
 from mddag_executor.core.tally import SinkTally
-from mddag_executor.simulate.workload import draw_execution_times, scale_execution_times
-from mddag_executor.simulate.workload import utilisation as normalised
+from mddag_executor.simulate.execution_times import draw_execution_times, scale_execution_times
+from mddag_executor.simulate.execution_times import utilisation as normalised
 from msg_graph import Dag, TaskSet, Vertex
 from msg_graph.model import path_lengths
 

@@ -20,7 +20,7 @@ import random
 from typing import Any
 
 from mddag_executor.recording.columns import Ints
-from mddag_executor.simulate.workload import check_execution_times
+from mddag_executor.simulate.execution_times import check_execution_times
 from mddag_executor.sources.bag_run import read_bag
 from mddag_executor.whatif.reschedule import Reschedule, reschedule
 from msg_graph import Dag, TaskSet

@@ -45,13 +45,13 @@ from mddag_executor.recording.tables import UNKNOWN
 from mddag_executor.simulate import (
     END,
     JOB_ENDED,
-    Load,
     LogEntry,
     RELEASE,
     SimulatedRun,
     START,
+    Workload,
 )
-from mddag_executor.simulate.load import edge_numbers, FAILS
+from mddag_executor.simulate.workload import edge_numbers, FAILS
 from mddag_executor.sources.executions import Numbering
 from msg_graph import TaskSet
 import numpy as np
@@ -75,7 +75,7 @@ class ComputedRun(NamedTuple):
     """
 
     task_set: TaskSet
-    load: Load
+    load: Workload
     log: Sequence[LogEntry]
     decisions: Sequence[Decision]
     end: int
@@ -85,7 +85,7 @@ class ComputedRun(NamedTuple):
     judged_releases: tuple[int, int] | None = None
 
     @classmethod
-    def of_run(cls, task_set: TaskSet, load: Load, run: SimulatedRun) -> ComputedRun:
+    def of_run(cls, task_set: TaskSet, load: Workload, run: SimulatedRun) -> ComputedRun:
         """Return a run that was simulated with its log."""
         stopped = run.settings.stop_at_first_miss and run.ended_ns < run.settings.duration_ns
         judged = run.settings.judge == 'horizon' and not stopped
@@ -158,7 +158,7 @@ class _Tables:
 
     def __init__(self, schedule: ComputedRun) -> None:
         self._schedule = schedule
-        self._load: Any = Load(*(np.asarray(each, dtype=np.int64)  # type: ignore[arg-type]
+        self._load: Any = Workload(*(np.asarray(each, dtype=np.int64)  # type: ignore[arg-type]
                                  for each in schedule.load))
         self._tables = Tables.build(schedule.task_set)
         self._n_dags = self._tables.n_dags

@@ -52,9 +52,9 @@ from mddag_executor.recording import tables as recorded_tables
 from mddag_executor.recording.columns import Ints
 from mddag_executor.recording.joins import as_of, distinct, sort_by
 from mddag_executor.recording.recording import Recording
-from mddag_executor.simulate import Load
+from mddag_executor.simulate import Workload
 from mddag_executor.simulate.deliveries import DELAY_NS
-from mddag_executor.simulate.load import edge_numbers, FAILS, RUNS, SKIPPED
+from mddag_executor.simulate.workload import edge_numbers, FAILS, RUNS, SKIPPED
 from mddag_executor.whatif.dispatches import dispatch_times
 from msg_graph import Dag
 from msg_graph.model import optional_edges, topological_order
@@ -75,7 +75,7 @@ class RecordedLoad(NamedTuple):
     ``transport_ns`` are measured medians, None if nothing was measured.
     """
 
-    load: Load
+    load: Workload
     jobs: Sequence[Ints]
     demand: int
     executions: int
@@ -500,7 +500,7 @@ class LoadBuilder:
             shared = Spans(*crowded(start[mine], end[mine], 2)).within(start[mine], end[mine])
             took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)
 
-    def _load(self, costs: Any, others: Ints, overheads: bool, one_worker: bool) -> Load:
+    def _load(self, costs: Any, others: Ints, overheads: bool, one_worker: bool) -> Workload:
         n_dags = len(self._numbers)
         counts = [len(others), *map(len, self._numbers)]
         releases, times = [others], [others]
@@ -516,7 +516,7 @@ class LoadBuilder:
         columns: list[Any] = [
             column[order] for column in (ready, dags, rows, np.concatenate(releases))]
         ready, dags, rows, release = columns
-        return Load(ready, dags, rows, costs, self._begins[_VERTEX].tolist(),
+        return Workload(ready, dags, rows, costs, self._begins[_VERTEX].tolist(),
                     [*self._widths[_VERTEX].tolist(), 1], release)
 
     def _transports(self, overheads: bool, process: Sequence[int]) -> tuple[Any, int | None]:

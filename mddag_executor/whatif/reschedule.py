@@ -25,9 +25,9 @@ from mddag_executor.recording.head import Head, ReplayError
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import UNKNOWN
 from mddag_executor.simulate import LogEntry, schedule, Settings
-from mddag_executor.simulate.load import SKIPPED
+from mddag_executor.simulate.execution_times import with_execution_times
 from mddag_executor.simulate.policies import ALL_POLICIES, preempts, ROS2
-from mddag_executor.simulate.workload import with_execution_times
+from mddag_executor.simulate.workload import SKIPPED
 from mddag_executor.sources.open import Given, open_recording, Progress, undeclared
 from mddag_executor.text import counted, listed
 from mddag_executor.whatif.computed import ComputedRun

@@ -26,7 +26,7 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, rad_offsets, Tables
 from mddag_executor.core.tables import ON_LATE
 from mddag_executor.recording import tables
 from mddag_executor.recording.columns import Table
-from mddag_executor.simulate import Load, SimulatedRun
+from mddag_executor.simulate import SimulatedRun, Workload
 from mddag_executor.trace import TraceFile
 from mddag_executor.whatif.computed import ComputedRun
 from msg_graph import TaskSet
@@ -39,7 +39,7 @@ _Entry = tuple[tuple[int, int, int], str, int, int, tuple[Any, ...]]
 
 
 def write_trace(
-    path: str | os.PathLike[str], task_set: TaskSet, load: Load, run: SimulatedRun
+    path: str | os.PathLike[str], task_set: TaskSet, load: Workload, run: SimulatedRun
 ) -> None:
     """Write the trace of a run that was simulated with its log."""
     settings = run.settings

@@ -43,9 +43,9 @@ from mddag_executor.core import NEVER, Tables
 from mddag_executor.core.jobs import is_miss
 from mddag_executor.core.requirements import as_dags
 from mddag_executor.core.state import Decision, SINK_IN_TIME
-from mddag_executor.simulate import Load, schedule, Settings
-from mddag_executor.simulate.load import as_arrays
+from mddag_executor.simulate import schedule, Settings, Workload
 from mddag_executor.simulate.schedule import prepare
+from mddag_executor.simulate.workload import as_arrays
 from msg_graph import TaskSet
 from msg_graph.derive import gc_paused
 import numpy as np
@@ -98,7 +98,7 @@ class Problem(NamedTuple):
     :ivar dispatches: the dispatch part of the first of ``load.costs``.
     """
 
-    load: Load
+    load: Workload
     settings: Settings
     tables: Tables
     callback_of: list[int]
@@ -185,7 +185,7 @@ class Search:
         """Return whether deadlines are missed with factor 1, so that factors are below 1."""
         return self._first is not None
 
-    def _callback_of_cost(self, load: Load, tables: Tables) -> Any:
+    def _callback_of_cost(self, load: Workload, tables: Tables) -> Any:
         """Return by index of a cost its callback; -1: undeclared."""
         of = np.full(len(load.costs), -1, dtype=np.int64)
         jobs = np.bincount(load.dags, minlength=tables.n_dags).tolist()
@@ -198,7 +198,7 @@ class Search:
         return of
 
     def _decisions(
-        self, load: Load, end: int = NEVER, stop: bool = False
+        self, load: Workload, end: int = NEVER, stop: bool = False
     ) -> Sequence[Decision]:
         problem = self._problem
         settings = replace(
@@ -207,14 +207,14 @@ class Search:
         with gc_paused():
             return schedule(problem.tables, load, settings, compiled=self.compiled).decisions
 
-    def _misses(self, load: Load, end: int, stop: bool) -> list[Miss]:
+    def _misses(self, load: Workload, end: int, stop: bool) -> list[Miss]:
         """Return the additional misses."""
         relative = self._problem.tables.sink_deadline
         return [Miss(vertex, deadline, deadline - relative[vertex], until)
                 for kind, _, vertex, job, deadline, until in self._decisions(load, end, stop)
                 if is_miss(kind) and (vertex, job) not in self._known]
 
-    def _scaled(self, callback: int, factor: float) -> Load:
+    def _scaled(self, callback: int, factor: float) -> Workload:
         """Return the load with a longer callback."""
         load, which = self._load, self._of == callback if callback != ALL else self._of >= 0
         costs, computed = load.costs.copy(), load.computed.copy()
@@ -223,7 +223,7 @@ class Search:
         if len(computed):
             which &= computed >= 0
             computed[which] = np.minimum(computed[which] * factor, NEVER >> 8).astype(np.int64)
-        scaled: Load = load._replace(costs=costs, computed=computed)
+        scaled: Workload = load._replace(costs=costs, computed=computed)
         return scaled
 
     def miss(

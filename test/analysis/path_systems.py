@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random systems with a path over several DAGs, and their simulation."""
 
-from mddag_executor.simulate import draw_execution_times, periodic_load, Settings, simulate
+from mddag_executor.simulate import draw_execution_times, periodic_workload, Settings, simulate
 from mddag_executor.whatif.computed import ComputedRun
 
 from ..sources.helpers import MS
@@ -42,6 +42,6 @@ def path_of(callbacks):
 
 def simulated_run(task_set):
     settings = Settings(workers=task_set.workers, duration_ns=600 * MS)
-    load = periodic_load(task_set, draw_execution_times(task_set, 0), settings.duration_ns)
+    load = periodic_workload(task_set, draw_execution_times(task_set, 0), settings.duration_ns)
     run = simulate(task_set, load, settings, log=True)
     return run.result(), ComputedRun.of_run(task_set, load, run)

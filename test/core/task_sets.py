@@ -15,7 +15,7 @@ from mddag_executor.core import Scheduler, Tables
 from mddag_executor.simulate import (
     ALL_POLICIES,
     END,
-    periodic_load,
+    periodic_workload,
     PREEMPT,
     Settings,
     simulate,
@@ -43,7 +43,7 @@ class Case:
     def load(self, ticks):
         """Return the periodic load of all releases before a time."""
         times_ns = [[tick * TICK for tick in row] for row in self.ticks]
-        return periodic_load(self.task_set, times_ns, ticks * TICK)
+        return periodic_workload(self.task_set, times_ns, ticks * TICK)
 
     def run(self, horizon, judge='horizon', stop=False, last_release=None):
         """Simulate it; times in ticks."""

@@ -22,7 +22,7 @@ from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.evaluate import evaluate
 from mddag_executor.laboratory.experiment import Experiment
 from mddag_executor.laboratory.generate import generate, Options
-from mddag_executor.simulate import compiled, periodic_load, Settings, simulate
+from mddag_executor.simulate import compiled, periodic_workload, Settings, simulate
 from msg_graph import load, loads
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def test_verdicts_are_those_of_simulate(autoware):
             autoware.dags, np.cumsum([0, *(len(dag.vertices) for dag in autoware.dags)]))]
         for j, (name, preemptive) in enumerate((('rad', True), ('wc', False))):
             run = simulate(
-                autoware, periodic_load(autoware, rows, 500_000_000),
+                autoware, periodic_workload(autoware, rows, 500_000_000),
                 Settings(name, 7, 500_000_000, preemptive, 'completions'))
             assert outcome.accepted[j, i] == (not run.tally.missed)
     assert 0 < outcome.accepted.mean() < 1

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.laboratory.necessary import largest_demand, necessary_tests
 from mddag_executor.laboratory.tasks import tasks_of
-from mddag_executor.simulate import periodic_load, Settings, simulate
+from mddag_executor.simulate import periodic_workload, Settings, simulate
 from msg_graph import loads
 
 from ..conftest import examples
@@ -41,7 +41,7 @@ def random_graph(seed, one_deadline, dags, load):
 def missed(task_set, policy, workers):
     times = [[vertex.callback.execution_time.mean_ns for vertex in dag.vertices]
              for dag in task_set.dags]
-    run = simulate(task_set, periodic_load(task_set, times, HORIZON), Settings(
+    run = simulate(task_set, periodic_workload(task_set, times, HORIZON), Settings(
         policy=policy, workers=workers, duration_ns=HORIZON, preemptive=True,
         stop_at_first_miss=True))
     return bool(run.result()['deadline_missed'])

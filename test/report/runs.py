@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mddag_executor.simulate import (
     draw_execution_times,
-    periodic_load,
+    periodic_workload,
     scale_execution_times,
     Settings,
     simulate,
@@ -79,6 +79,6 @@ def simulated(task_set, *, utilisation=0.95, workers=5, ms=300, seed=0, **settin
     """Simulate with a log."""
     times = scale_execution_times(
         task_set, draw_execution_times(task_set, seed), workers, utilisation)
-    load = periodic_load(task_set, times, ms * MS)
+    load = periodic_workload(task_set, times, ms * MS)
     return load, simulate(
         task_set, load, Settings(workers=workers, duration_ns=ms * MS, **settings), log=True)

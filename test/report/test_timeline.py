@@ -5,7 +5,7 @@
 from mddag_executor import open_recording, replay, reschedule
 from mddag_executor.report import html
 from mddag_executor.report.timeline import Timeline
-from mddag_executor.simulate import periodic_load, Settings, simulate
+from mddag_executor.simulate import periodic_workload, Settings, simulate
 from mddag_executor.whatif.bags_reschedule import reschedule_bag
 from mddag_executor.whatif.computed import ComputedRun
 from mddag_executor.whatif.run_writer import write_trace
@@ -64,7 +64,7 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path):
     task_set = msg_graph.loads(
         runs.GRAPH.replace('deadline: 8ms', 'deadline: 8ms, execution_time: 30ms')
         .replace('timer: 10ms', 'timer: 10ms, execution_time: 1ms, max_active_jobs: 2'), 'g.yaml')
-    load = periodic_load(task_set, [[runs.MS, 30 * runs.MS]], 100 * runs.MS)
+    load = periodic_workload(task_set, [[runs.MS, 30 * runs.MS]], 100 * runs.MS)
     run = simulate(task_set, load, Settings(workers=1, duration_ns=100 * runs.MS), log=True)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     seen = ComputedRun(

@@ -18,7 +18,7 @@ from mddag_executor.rerun import assert_same, CallbackFailed, compare, programs,
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.inputs import MessageBag, open_input
 from mddag_executor.rerun.run import Rerun
-from mddag_executor.simulate import draw_execution_times, Load, periodic_load, simulate
+from mddag_executor.simulate import draw_execution_times, periodic_workload, simulate, Workload
 from mddag_executor.simulate import Settings as SimulatorSettings
 from mddag_executor.trace import TraceReader
 from msg_graph import load, loads
@@ -216,7 +216,7 @@ def test_recorded_publications_belong_to_their_executions(bag, graph, tmp_path, 
 def test_messages_leave_at_the_end_and_take_their_recorded_time(bag, graph, delay_ms, out_ms):
     """Each callback takes 10 ms; what was recorded before a callback's end arrives at the end."""
     task_set = load(str(graph))
-    recorded = Load([0], [0], [0], [0, 10 * MS, 10 * MS], [0], [0],
+    recorded = Workload([0], [0], [0], [0, 10 * MS, 10 * MS], [0], [0],
                     delays=[0, delay_ms * MS], delay_base=[0], delay_stride=[0])
     times = Durations(Tables.build(task_set), recorded, recorded=True)
     result = Rerun(MessageBag(bag), times, task_set, workers=2).run(
@@ -255,7 +255,7 @@ def test_callbacks_start_and_end_as_in_the_simulator(tmp_path, monkeypatch, seed
             callback['holds_interpreter'] = (place + seed) % 2 == 0
     task_set = loads(yaml.safe_dump(declared, sort_keys=False))
     simulated = simulate(
-        task_set, periodic_load(task_set, draw_execution_times(task_set, 0), 1000 * MS),
+        task_set, periodic_workload(task_set, draw_execution_times(task_set, 0), 1000 * MS),
         SimulatorSettings('rad', workers, 1000 * MS, cpus=cpus, on_late='demote'),
         log=True).log
     bag = write_bag(tmp_path / 'in.mcap', [(ms, '/unused', String()) for ms in (0, 1000)])

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from mddag_executor.core import Tables, Tally
 from mddag_executor.laboratory.experiment import judge_of
 from mddag_executor.simulate import compiled, schedule, Settings, simulate
-from mddag_executor.simulate.load import as_arrays, FAILS, RUNS, SKIPPED
 from mddag_executor.simulate.policies import ROS2
+from mddag_executor.simulate.workload import as_arrays, FAILS, RUNS, SKIPPED
 import numpy as np
 import pytest
 

@@ -10,11 +10,11 @@ from mddag_executor.core import queues, Tables
 from mddag_executor.simulate import (
     END,
     engine,
-    Load,
     machine,
     schedule,
     Settings,
     START,
+    Workload,
 )
 import pytest
 
@@ -49,7 +49,7 @@ def times(jobs, workers, cpus=None, python=False, preemptive=False, divided=Fals
         process=[*(job.interpreter for job in jobs), 1])
     order = sorted(range(len(jobs)), key=lambda n: (jobs[n].release, n))
     n = len(jobs)
-    load = Load([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
+    load = Workload([jobs[i].release for i in order], order, [0] * n, [job.cost for job in jobs],
                 list(range(n)), [0] * n, holds=[job.interpreter * job.holds for job in jobs],
                 computed=[job.cost if job.cpu is None else job.cpu for job in jobs])
     with pytest.MonkeyPatch.context() as patch:

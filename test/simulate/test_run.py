@@ -16,14 +16,14 @@ from mddag_executor.simulate import (
     draw_execution_times,
     END,
     JOB_ENDED,
-    Load,
-    periodic_load,
+    periodic_workload,
     RELEASE,
     scale_execution_times,
     Settings,
     simulate,
     START,
     utilisation,
+    Workload,
 )
 from mddag_executor.whatif.run_writer import write_trace
 from msg_graph import load, loads
@@ -78,7 +78,7 @@ def test_autoware_runs_as_in_the_paper_s_program(seed, policy):
     task_set = load(AUTOWARE)
     times = [[-(-time // 1000) * 1000 for time in row]
              for row in draw_execution_times(task_set, seed)]
-    run = simulate(task_set, periodic_load(task_set, times, 3 * 10 ** 9), Settings(
+    run = simulate(task_set, periodic_workload(task_set, times, 3 * 10 ** 9), Settings(
         policy=policy, workers=7, duration_ns=3 * 10 ** 9, preemptive=None,
         judge='completions', stop_at_first_miss=True))
     worst = {}
@@ -96,7 +96,7 @@ def test_autoware_runs_as_in_the_paper_s_program(seed, policy):
 
 def test_a_source_may_get_ready_after_its_release():
     """As with a header stamp: the deadline counts from the release."""
-    load = Load([5 * US], [0], [0], [2 * US, 2 * US], [0, 2], [0, 0], releases=[1])
+    load = Workload([5 * US], [0], [0], [2 * US, 2 * US], [0, 2], [0, 0], releases=[1])
     run = simulate(two_dags(), load, Settings(workers=1, duration_ns=100 * US))
     sink = run.result()['dags']['a']['sinks']['/n:x@a']
     assert (sink['completed'], sink['late']) == (1, 0)
@@ -112,7 +112,7 @@ def test_the_log_has_releases_and_early_ends_in_the_order_of_the_engine():
     """A release expires the job before it; what waits of that job still runs."""
     task_set = declaration([{'node': '/n', 'name': 't', 'timer': '10us', 'deadline': '9us',
                              'max_active_jobs': 1, 'execution_time': '25us'}])
-    run = simulate(task_set, periodic_load(task_set, [[25 * US]], 26 * US),
+    run = simulate(task_set, periodic_workload(task_set, [[25 * US]], 26 * US),
                    Settings(workers=1, duration_ns=26 * US), log=True)
     assert [*map(tuple, run.log)] == [
         (0, RELEASE, -1, 0, 0, 0), (0, START, 0, 0, 0, 0),
@@ -123,7 +123,7 @@ def test_the_log_has_releases_and_early_ends_in_the_order_of_the_engine():
 
 def test_a_bound_for_all_dags_and_one_of_its_own():
     task_set = two_dags(max_active_jobs=3)
-    load = periodic_load(task_set, [[1, 900 * US], [900 * US, 1]], 100 * US)
+    load = periodic_workload(task_set, [[1, 900 * US], [900 * US, 1]], 100 * US)
     settings = Settings(workers=2, duration_ns=100 * US)
     for more, expired in (({'max_active_jobs': 2}, [10 - 3, 25 - 2]), ({}, [10 - 3, 0])):
         dags = simulate(task_set, load, settings, **more).result()['dags']
@@ -141,7 +141,7 @@ def test_a_bound_for_all_dags_and_one_of_its_own():
     ({'dispatch_overhead_ns': -1}, 'overhead'), ({'switch_overhead_ns': -1}, 'overhead'),
 ])
 def test_settings_that_make_no_sense(setting, says):
-    load = periodic_load(two_dags(), [[1, 1], [1, 1]], US)
+    load = periodic_workload(two_dags(), [[1, 1], [1, 1]], US)
     with pytest.raises(MddagError, match=says):
         simulate(two_dags(), load, replace(Settings(), **setting))
 
@@ -283,7 +283,7 @@ nodes:
           holds_interpreter: {holds}}}
 """, 'g.yaml')
     horizon = 160_000_000
-    load_ = periodic_load(task_set, draw_execution_times(task_set, 0), horizon)
+    load_ = periodic_workload(task_set, draw_execution_times(task_set, 0), horizon)
     run = simulate(task_set, load_, Settings(workers=2, duration_ns=horizon, cpus=cpus), log=True)
     trace.unlink(missing_ok=True)
     write_trace(trace, task_set, load_, run)

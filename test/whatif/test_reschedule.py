@@ -11,7 +11,7 @@ from mddag_executor.recording.columns import rows
 from mddag_executor.recording.tables import EXECUTIONS
 from mddag_executor.simulate import PREEMPT, Settings, simulate, START
 from mddag_executor.simulate.deliveries import DELAY_NS
-from mddag_executor.simulate.load import Load
+from mddag_executor.simulate.workload import Workload
 from mddag_executor.trace.schema import GOES_ON
 from mddag_executor.whatif import agreement
 from mddag_executor.whatif.agreement import disagreement
@@ -38,7 +38,7 @@ def starts(log):
 
 def write_two(path, **settings):
     """Record a run of 20 ms with a slow job from 0 to 12 and fast ones at 5 and 15 ms."""
-    load = Load([0, 5 * MS, 15 * MS], [0, 1, 1], [0, 0, 1], [12 * MS, 2 * MS, 2 * MS], [0, 1],
+    load = Workload([0, 5 * MS, 15 * MS], [0, 1, 1], [0, 0, 1], [12 * MS, 2 * MS, 2 * MS], [0, 1],
                 [1, 1])
     task_set = loads(TWO, 'two.yaml')
     settings = Settings(**{'workers': 2, 'duration_ns': 20 * MS, **settings})

@@ -6,7 +6,7 @@ import json
 
 from mddag_executor import reschedule
 from mddag_executor.core import Tables
-from mddag_executor.simulate import periodic_load, Settings
+from mddag_executor.simulate import periodic_workload, Settings
 from mddag_executor.whatif import slack as module
 from mddag_executor.whatif.slack import find_slack, Problem, Search
 from msg_graph import loads
@@ -160,7 +160,7 @@ def test_a_callback_that_does_not_help_costs_one_short_run(monkeypatch):
         'execution_time: 1ms}]}\n' for i in range(20))
     task_set = loads('mddag: 1\nworkers: 1\nnodes:\n' + nodes, 'g.yaml')
     settings = Settings(policy='rad', workers=1, duration_ns=2_000 * MS)
-    load = periodic_load(task_set, [[MS]] * 20, settings.duration_ns)
+    load = periodic_workload(task_set, [[MS]] * 20, settings.duration_ns)
     lengths = []
 
     def counted(tables, load, settings, **options):
