@@ -69,7 +69,7 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path):
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     seen = ComputedRun(
         task_set, load, run.log, run.decisions, run.ended_ns,
-        numbers=[[10 * job for job in range(10)]]).recording()
+        numbers=[10 * np.arange(10)]).recording()
     assert len(seen.job_ends) > 1
     same_tables(seen, open_recording(tmp_path / 'run.mcap'), 10)
 
