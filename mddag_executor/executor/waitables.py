@@ -13,7 +13,8 @@ Theory of operation
     they are rare.
 3.  Setting the listener of a QoS event marks earlier events as known, so a wait set does not
     report them any more.  Therefore all events are taken, and those with unchanged counts are
-    dropped.
+    dropped.  It also forgets by how much the counts have changed since they were taken.  So an
+    event keeps its listener when the shared source is made again.
 4.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next.
 5.  *The exception* is a thread that waits in a wait set (``WaitSetThread``).  It waits for rclpy's
     signal condition, because rclpy's handler of SIGTERM is written in C++: it triggers the
@@ -203,9 +204,9 @@ class WaitableSource(ChannelSource):
 
     def __init__(self, entities: Iterable[Entity], pool: Hall) -> None:
         super().__init__()
-        self._entities = list(entities)
+        self.entities = list(entities)
         self._pool = pool
-        self._asked = Asked(self._entities, pool)
+        self._asked = Asked(self.entities, pool)
         self._set = self._asked.set
         self._timers: list[NextCall] = []
         self._guards: list[int] = []
@@ -224,20 +225,33 @@ class WaitableSource(ChannelSource):
         if kind == 'timer':
             self._timers.append(NextCall(address))
 
-    def listen(self) -> None:
-        """Let the middleware announce arrivals, or raise ListenerError or InvalidHandle."""
+    def listen(self, before: WaitableSource | None = None) -> None:
+        """
+        Let the middleware announce arrivals, or raise ListenerError or InvalidHandle.
+
+        :param before: a source with the same descriptor, whose entities have listeners already.
+        """
+        new = None if before is None else [each.rclpy_object for each in self._without(before)]
         with self._lock:  # announcements meanwhile must not also fill the wait set
-            self._set.parts(lambda kind, address: set_listener(kind, address, self.fd))
+            self._set.parts(lambda kind, address: set_listener(kind, address, self.fd), new)
         if self._has_more:
             self._ask()
 
-    def close(self) -> None:
-        """End ``listen``, and wait until no thread collects from it."""
+    def _without(self, other: WaitableSource | None) -> list[Entity]:
+        theirs = () if other is None else other.entities
+        return [each for each in self.entities if each not in theirs]
+
+    def close(self, kept_by: WaitableSource | None = None) -> None:
+        """
+        End ``listen``, and wait until no thread collects from it.
+
+        :param kept_by: a source with the same descriptor, whose entities keep their listeners.
+        """
         self._ignored = True
         with self._lock:
             for address in self._guards:  # of destroyed ones as well
                 clear_listener('guard_condition', address, self.fd)
-            call_with_living([each for each in self._entities
+            call_with_living([each for each in self._without(kept_by)
                               if isinstance(each.rclpy_object, Waitable)], self._clear)
         with self._pool.lock:
             self._pool.loop.remove(self)
@@ -315,21 +329,23 @@ def _living(entities: list[Entity]) -> list[Entity]:
 
 
 def open_source(
-    make: Callable[[list[Entity], Hall], WaitableSource], entities: list[Entity], pool: Hall
+    make: Callable[[list[Entity], Hall], WaitableSource], entities: list[Entity], pool: Hall,
+    share: str = '', before: WaitableSource | None = None,
 ) -> WaitableSource | None:
     """
     Return a source of the entities that listens; None: they are all destroyed.
 
+    :param share: see ``EventLoop.add``; ``before``: see ``WaitableSource.listen``.
     :raises ListenerError: when there is no listener for one of them.
     """
     def listen(alive: list[Entity]) -> WaitableSource:
         source = make(alive, pool)
         with pool.lock:
-            pool.loop.add(source)
+            pool.loop.add(source, share)
         try:
-            source.listen()
+            source.listen(before)
         except (InvalidHandle, ListenerError):
-            source.close()
+            source.close(before)
             raise
         return source
 
@@ -408,16 +424,17 @@ class SharedSource:
         if not self._has_changed:
             return
         self._has_changed = False
-        source, self._source = self._source, None
-        if source is not None:
-            source.close()
+        before, self._source = self._source, None
         for entity in self._entities:
             self._unlistened.remove(entity)
         try:
-            self._source = open_source(self._make, list(self._entities), self._pool)
+            self._source = open_source(
+                self._make, list(self._entities), self._pool, 'QoS events', before)
         except ListenerError:
             for entity in self._entities:
                 self._unlistened.add(entity)
+        if before is not None:
+            before.close(self._source)
 
 
 class WaitSetThread:

@@ -119,10 +119,10 @@ def test_events_keep_their_listener_when_another_one_is_destroyed_meanwhile(
     executor = make_executor(nodes=[node])
     listen, add = EventsSource.listen, EventHandler.add_to_wait_set
 
-    def destroy_before(self):
+    def destroy_before(self, before=None):
         while victims:
             node.destroy_subscription(victims.pop())
-        listen(self)
+        listen(self, before)
 
     def note(self, wait_set):
         waiting.add(threading.current_thread().name)
@@ -137,6 +137,24 @@ def test_events_keep_their_listener_when_another_one_is_destroyed_meanwhile(
             subscriptions.insert(0, node.create_subscription(Header, f'/n{number}', print, 10))
             assert wait_for(lambda: not victims)
     assert waiting and 'mddag-wait-set' not in waiting
+
+
+def test_an_event_keeps_its_change_when_others_are_created(make_executor, make_node):
+    """Setting a listener again would forget by how much the counts have changed."""
+    node, other, seen = make_node(), make_node('other'), []
+    publisher = node.create_publisher(
+        Header, '/topic', 10, event_callbacks=PublisherEventCallbacks(
+            matched=lambda info: seen.append((info.current_count, info.current_count_change))))
+    executor = make_executor(nodes=[node])
+    executor.spin_once(0.0)
+    for number in (1, 2, 3):
+        other.create_subscription(Header, '/topic', print, 10)
+        assert wait_for(lambda: publisher.get_subscription_count() == number)  # noqa: B023
+        node.create_subscription(Header, f'/n{number}', print, 10)
+        end = time.monotonic() + 15
+        while len(seen) < number and time.monotonic() < end:
+            executor.spin_once(0.1)
+    assert seen == [(1, 1), (2, 1), (3, 1)]
 
 
 def test_the_middleware_writes_to_no_file_after_the_executor_has_ended(
@@ -189,7 +207,7 @@ def test_what_is_triggered_runs(make_executor, make_node, spinning, monkeypatch,
     guard.trigger()  # nothing listens yet
     seen.guard.trigger()
     if not listens:
-        def listen(self):
+        def listen(self, before=None):
             raise ListenerError('the middleware has none')
         monkeypatch.setattr(WaitableSource, 'listen', listen)
 
