@@ -65,13 +65,14 @@ endif
 
 # Public programs under rclpy's executor and under this one; PUBLIC is a folder with their sources,
 # and install/ with what else they import (colcon build --merge-install, pip install --prefix).
+# PUBLIC_ARGS: --only NAME, --interrupts N, …
 test-public: env
 ifneq ($(and $(PUBLIC),$(wildcard $(PUBLIC)/*/.)),)
 	@at='$(abspath $(PUBLIC))/install' && \
 		PYTHONPATH="$$(echo "$$at"/lib/python3*/site-packages)" LD_LIBRARY_PATH="$$at/lib" \
-		$(BIN)/python test/endurance/public_programs.py '$(PUBLIC)'
+		$(BIN)/python test/endurance/public_programs.py '$(PUBLIC)' $(PUBLIC_ARGS)
 else
-	@echo 'test-public: skipped: PUBLIC=$(PUBLIC): no sources there: clone demos, diagnostics, … into it'
+	@echo 'test-public: skipped: PUBLIC=$(PUBLIC): no sources there: git clone -b jazzy https://github.com/ros2/demos (and examples, …) into it'
 endif
 
 test-kilted:

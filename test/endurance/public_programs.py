@@ -1,26 +1,33 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Public programs under rclpy's executor and under this one: what they publish is compared.
+Public programs under rclpy's executor and under this one: what they do is compared.
 
-    python test/endurance/public_programs.py SOURCES [--seconds 5] [--only NAME]
+    python test/endurance/public_programs.py SOURCES [--seconds 5] [--interrupts 20] [--only NAME]
 
 SOURCES is a folder with the sources of the packages, one folder for each repository.  Programs
 are run from there.  What they import beyond that (interfaces, libraries) must be importable
 already (``make test-public`` adds ``SOURCES/install``); a program whose imports or sources are
 missing is skipped with a line that says so.
 
-Each program runs twice with the same inputs, once with its own executor, once as ``mddag run
---node`` hosts it.  A node of this script counts the messages of every topic for some seconds,
-starting with the first message.  The two runs are the same if
+Each program runs with the same inputs under its own executor, and as ``mddag run --node`` hosts
+it.  First one run of each: a node of this script publishes the inputs, calls the services, and
+counts messages and responses for some seconds, starting with the first one.  The two runs are the
+same if
 
 * the same topics were published on, with the same types;
-* each topic had as many messages, give or take a quarter (a slow machine is no difference);
-* the last message of the topics in ``Program.constant`` was the same;
-* both ran until SIGINT, or neither, and had the same exit status.  (A signal counts as the status
-  that a shell makes of it.  A crash of the middleware at the end of a program by itself, SIGABRT
-  or SIGSEGV, is compared with nothing, nor is the error of a program that goes on after rclpy's
-  signal handler has shut the context down.)
+* each topic had as many messages, and each service as many responses, give or take a quarter (a
+  slow machine is no difference);
+* the last message of the topics in ``Program.constant`` and the last response of each service
+  were the same;
+* both ran until SIGINT, or neither.
+
+Then come runs that SIGINT ends at random moments, from the first line of the program on; most
+moments are early.  No run may hang.  What they do is compared as sets, because no two runs are
+interrupted at the same line of the program.  Each exit status of a hosted run must be one of the
+program's own (a signal counts as the status that a shell makes of it), and each line that it
+prints must be printed by one of the program's own runs, apart from numbers.  ``REASONS`` lists the
+differences that are documented.
 """
 
 import argparse
@@ -29,9 +36,12 @@ from importlib import import_module
 import os
 from pathlib import Path
 import random
+import re
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import time
 from typing import Any, NamedTuple
 
@@ -45,11 +55,18 @@ from std_msgs.msg import String
 
 TOLERANCE, FEW = 0.25, 3
 """Counts that differ by this part, or by so many messages, are the same."""
-START_S, END_S = 10.0, 15.0
+START_S, END_S = 15.0, 45.0
 """How long a program may take to publish first, and to end after SIGINT."""
+LATEST_S = 2.0
+"""The latest moment of an interrupt, after the first line of the program."""
+DOMAINS = range(40, 102)
+"""The ROS domains of the tests, which claim them in the same way."""
 
-_AFTER_THE_END = ('rcl_shutdown already called', 'context is invalid')
+_OK, _FAILED, _INTERRUPTED = 0, 1, 128 + signal.SIGINT
 _CRASHES = (128 + signal.SIGABRT, 128 + signal.SIGSEGV)
+_CONTEXT_ENDED = ('rcl_shutdown already called', 'context is invalid', 'context is not valid',
+                  'ExternalShutdownException')
+_BEGUN = 'the program begins'
 
 # for subscriptions of either durability
 _KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -67,12 +84,32 @@ class Program(NamedTuple):
     inputs: tuple[tuple[str, Any], ...] = ()  # messages by topic, published at 20 Hz
     constant: tuple[str, ...] = ()  # the topics whose last message must be the same
     parameters: tuple[str, ...] = ()  # ROS parameters, ``name:=value``
+    calls: tuple[tuple[str, str, dict[str, Any]], ...] = ()  # service, type, request; at 5 Hz
 
 
+_EXAMPLES = 'examples/rclpy'
 _DEMOS = ('demos/demo_nodes_py',)
 _DIAGNOSTICS = ('diagnostics/diagnostic_updater', 'diagnostics/diagnostic_common_diagnostics')
 _ROSBRIDGE = ('rosbridge_suite/rosbridge_library/src', 'rosbridge_suite/rosbridge_server/src',
               'rosbridge_suite/rosapi/src')
+_FLEXBE = tuple(f'flexbe_behavior_engine/flexbe_{each}' for each in (
+    'core', 'mirror', 'onboard', 'widget', 'input'))
+_SUM = (('/add_two_ints', 'example_interfaces/srv/AddTwoInts', {'a': 2, 'b': 3}),)
+
+
+def _examples(*names):
+    """Return programs of ros2/examples; a name is a package and its module."""
+    made = []
+    for name in names:
+        folder, package, module = name.split('/')
+        made.append(Program(
+            f'examples: {package} {module}', f'examples_rclpy_{package}.{module}:main',
+            (f'{_EXAMPLES}/{folder}/{package}' if folder else f'{_EXAMPLES}/{package}',),
+            (('/topic', String(data='Hello')), ('/chatter', String(data='Hello'))) * (
+                module in ('listener', 'custom_executor') or 'subscriber' in module),
+            calls=_SUM * ('minimal_service' in name)))
+    return made
+
 
 PROGRAMS = (
     Program('talker', 'demo_nodes_py.topics.talker:main', _DEMOS),
@@ -80,9 +117,31 @@ PROGRAMS = (
         ('/chatter', String(data='hello')),)),
     Program('talker_qos', 'demo_nodes_py.topics.talker_qos:main', _DEMOS),
     Program('set_parameters', 'demo_nodes_py.parameters.set_parameters_callback:main', _DEMOS),
+    Program('use_logger_service', 'demo_nodes_py.logging.use_logger_service:main', _DEMOS),
+    Program('matched_event', 'demo_nodes_py.events.matched_event_detect:main', _DEMOS),
+    Program('add_two_ints_server', 'demo_nodes_py.services.add_two_ints_server:main', _DEMOS,
+            calls=_SUM),
     Program('lifecycle_talker', 'lifecycle_py.talker:main', ('demos/lifecycle_py',)),
     Program('data_publisher', 'topic_monitor.scripts.data_publisher:main',
             ('demos/topic_monitor',)),
+    *_examples(
+        'topics/minimal_publisher/publisher_member_function',
+        'topics/minimal_publisher/publisher_local_function',
+        'topics/minimal_publisher/publisher_old_school',
+        'topics/minimal_subscriber/subscriber_member_function',
+        'topics/minimal_subscriber/subscriber_lambda',
+        'topics/minimal_subscriber/subscriber_old_school',
+        'services/minimal_service/service', 'services/minimal_service/service_member_function',
+        '/executors/callback_group', '/executors/composed', '/executors/custom_callback_group',
+        '/executors/custom_executor', '/executors/listener', '/executors/talker',
+        '/guard_conditions/trigger_guard_condition',
+        'actions/minimal_action_server/server',
+        'actions/minimal_action_server/server_queue_goals'),
+    Program('dynamic_broadcaster', 'examples_tf2_py.dynamic_broadcaster:main', (
+        'geometry2/examples_tf2_py', 'geometry2/tf2_ros_py', 'geometry2/tf2_py')),
+    Program('joy_teleop', 'joy_teleop.joy_teleop:main', ('teleop_tools/joy_teleop',)),
+    Program('nmea_topic_driver', 'libnmea_navsat_driver.nodes.nmea_topic_driver:main',
+            ('nmea_navsat_driver/src',)),
     Program('obstacle_detection',
             'turtlebot3_example.turtlebot3_obstacle_detection.turtlebot3_obstacle_detection:main',
             ('turtlebot3/turtlebot3_example',), (
@@ -100,11 +159,31 @@ PROGRAMS = (
             parameters=('address:=127.0.0.1',)),
     Program('tree_watcher', 'py_trees_ros.programs.tree_watcher:main', ('py_trees_ros',)),
     Program('gym_bridge', 'f1tenth_gym_ros.gym_bridge:main', ('f1tenth_gym_ros',)),
+    Program('crazyflie_sim', 'crazyflie_sim.crazyflie_server:main', (
+        'crazyswarm2/crazyflie_sim', 'crazyswarm2/crazyflie_py')),
+    Program('vel_mux', 'crazyflie_examples.vel_mux:main', (
+        'crazyswarm2/crazyflie_examples', 'crazyswarm2/crazyflie_py'), (
+            ('/cmd_vel', Twist(linear=Vector3(x=0.2))),)),
+    Program('epuck_drive_calibrator', 'webots_ros2_epuck.drive_calibrator:main', (
+        'webots_ros2/webots_ros2_epuck',)),
+    Program('tesla_lane_follower', 'webots_ros2_tesla.lane_follower:main', (
+        'webots_ros2/webots_ros2_tesla',)),
+    Program('behavior_mirror', 'flexbe_mirror.behavior_mirror_sm:main', _FLEXBE),
+    Program('be_input', 'flexbe_input.flexbe_input:main', _FLEXBE),
+    Program('behavior_onboard', 'flexbe_onboard.start_behavior:main', _FLEXBE),
+    Program('emergency_signal', 'rmf_demos_tasks.emergency_signal:main', (
+        'rmf_demos/rmf_demos_tasks',)),
+    Program('dispatch_patrol', 'rmf_demos_tasks.dispatch_patrol:main', (
+        'rmf_demos/rmf_demos_tasks',)),
+    Program('fleet_manager', 'rmf_demos_fleet_adapter.fleet_manager:main', (
+        'rmf_demos/rmf_demos_fleet_adapter',)),
+    Program('yasmin_demo', 'yasmin_demos.yasmin_demo:main', (
+        'yasmin/yasmin_demos', 'yasmin/yasmin')),
 )
 
 
 class Probe:
-    """A node that publishes a program's inputs and counts what the program publishes."""
+    """A node that publishes inputs and calls services, and counts what the program answers."""
 
     def __init__(self, program):
         self.counts, self.types, self.last = Counter(), {}, {}
@@ -115,6 +194,11 @@ class Probe:
         for topic, message in program.inputs:
             publisher = self.node.create_publisher(type(message), topic, _KEPT)
             self.node.create_timer(0.05, lambda p=publisher, m=message: p.publish(m))
+        for name, type_name, fields in program.calls:
+            kind = _interface(type_name)
+            client, request = self.node.create_client(kind, name), kind.Request(**fields)
+            self.node.create_timer(
+                0.2, lambda n=name, c=client, r=request: self._call(n, c, r))
         self.node.create_timer(0.1, self._look)
 
     def _look(self):
@@ -123,15 +207,18 @@ class Probe:
                     self.node.get_publishers_info_by_topic(topic)):
                 continue
             self.types[topic] = types[0]
-            package, _, name = types[0].split('/')
             self.node.create_subscription(
-                getattr(import_module(f'{package}.msg'), name), topic,
-                lambda message, topic=topic: self._count(topic, message),
-                qos_profile_sensor_data)
+                _interface(types[0]), topic,
+                lambda message, topic=topic: self._count(topic, message), qos_profile_sensor_data)
 
-    def _count(self, topic, message):
-        self.counts[topic] += 1
-        self.last[topic] = message
+    def _call(self, name, client, request):
+        if client.service_is_ready():
+            client.call_async(request).add_done_callback(
+                lambda future: self._count(name, future.result()))
+
+    def _count(self, name, value):
+        self.counts[name] += 1
+        self.last[name] = value
 
     def spin_for(self, seconds, process, first):
         """Spin for some seconds, or until the first message; not longer than a process runs."""
@@ -144,6 +231,11 @@ class Probe:
         self.node.destroy_node()
 
 
+def _interface(type_name):
+    package, kind, name = type_name.split('/')
+    return getattr(import_module(f'{package}.{kind}'), name)
+
+
 class Run(NamedTuple):
     """What a program did."""
 
@@ -152,40 +244,110 @@ class Run(NamedTuple):
     constant: dict[str, Any]
     end: str
     status: int
-    said: str
+    lines: frozenset[str]
 
 
-def observe(program, path, hosted, seconds):
-    """Run a program under one of the executors; return what it did."""
-    os.environ['ROS_DOMAIN_ID'] = str(random.randrange(1, 40))  # the tests use those from 40 on
-    module, function = program.spec.split(':')
-    command = ['-c', f'import sys; sys.argv[0] = {module!r}; import {module} as m; m.{function}()']
-    if hosted:
-        command = ['-m', 'mddag_executor', 'run', '--node', program.spec, '--diagnostics', 'off']
-    for parameter in program.parameters:
-        command += ['--ros-args', '-p', parameter]
+class Place:
+    """
+    Where programs run: their modules, and a ROS domain that no test of this machine has.
+
+    :param paths: the folders of the program's packages, and what else has to be importable.
+    :param folder: a temporary one, for a module that says when the program begins.
+    """
+
+    def __init__(self, program, paths, folder):
+        self.program = program
+        module, function = program.spec.split(':')
+        Path(folder, 'begun.py').write_text(
+            f'import {module} as m\n\n\ndef main():\n    print({_BEGUN!r}, flush=True)\n'
+            f'    return m.{function}()\n')
+        self._env = {**os.environ, 'PYTHONPATH': os.pathsep.join([str(folder), *paths]),
+                     'PYTHONUNBUFFERED': '1', 'RCUTILS_COLORIZED_OUTPUT': '0'}
+
+    def start(self, hosted):
+        """Start the program with its own executor, or with this one."""
+        command = ['-c', f'import sys; sys.argv[0] = {self.program.name!r}\n'
+                   'from begun import main\nsys.exit(main())']
+        if hosted:
+            command = ['-m', 'mddag_executor', 'run', '--node', 'begun:main', '--diagnostics',
+                       'off', '--quiet']
+        if self.program.parameters:
+            command += ['--ros-args']
+        for parameter in self.program.parameters:
+            command += ['-p', parameter]
+        return subprocess.Popen(
+            [sys.executable, *command], env=self._env, text=True, errors='replace',
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+
+
+def claim_domain():
+    """Set a ROS domain that no test has; return what claims it."""
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        claim = socket.socket(socket.AF_UNIX)
+        try:
+            claim.bind(f'\0mddag-test-domain-{domain}')
+        except OSError:
+            claim.close()
+        else:
+            os.environ['ROS_DOMAIN_ID'] = str(domain)
+            return claim
+    sys.exit('error: every ROS domain for tests is in use: try again later')
+
+
+def _status(process):
+    """Return its exit status; that of a shell for a signal."""
+    return process.returncode if process.returncode >= 0 else 128 - process.returncode
+
+
+def _lines(said):
+    """Return the lines that a program has printed, without numbers, times and places."""
+    found = set()
+    for line in said.splitlines():
+        line = re.sub(r'^\[(\w+)\] \[[\d.]+\] \[(.*?)\]:', r'[\1] \2:', line.rstrip())
+        line = re.sub(r'0x[0-9a-f]+|\d+(\.\d+)?(e-?\d+)?|[0-9a-f]{8}-[0-9a-f-]{27}', '#', line)
+        if line and line != _BEGUN and not line.startswith((' ', 'Traceback', '^')):
+            found.add(line)
+    return frozenset(found)
+
+
+def observe(place, hosted, seconds):
+    """Run a program under one of the executors, for some seconds; return what it did."""
+    program = place.program
     rclpy.init()
     probe = Probe(program)
-    with subprocess.Popen(
-        [sys.executable, *command], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)},
-    ) as process:
+    with place.start(hosted) as process:
         try:
             probe.spin_for(START_S, process, True)
             probe.counts.clear()
             probe.spin_for(seconds, process, False)
             end = 'by SIGINT' if process.poll() is None else 'by itself'
             process.send_signal(signal.SIGINT)
-            _, said = process.communicate(timeout=END_S)
+            said, _ = process.communicate(timeout=END_S)
         except subprocess.TimeoutExpired:
             end, said = 'not even by SIGINT', ''
         finally:
             process.kill()
             probe.close()
             rclpy.shutdown()
-    constant = {topic: probe.last.get(topic) for topic in program.constant}
-    status = process.returncode if process.returncode >= 0 else 128 - process.returncode
-    return Run(probe.types, probe.counts, constant, end, status, said)
+    names = (*program.constant, *(name for name, *_ in program.calls))
+    constant = {name: probe.last.get(name) for name in names}
+    return Run(probe.types, probe.counts, constant, end, _status(process), _lines(said))
+
+
+def interrupt(place, hosted, after):
+    """Run a program, and send SIGINT some seconds after it has begun; return status and lines."""
+    with place.start(hosted) as process:
+        try:
+            if process.stdout.readline().strip() != _BEGUN:
+                return None, frozenset()
+            time.sleep(after)
+            process.send_signal(signal.SIGINT)
+            said, _ = process.communicate(timeout=END_S)
+        except subprocess.TimeoutExpired:
+            return 'hangs', frozenset()
+        finally:
+            process.kill()
+    return _status(process), _lines(said)
 
 
 def differences(theirs, ours):
@@ -196,10 +358,44 @@ def differences(theirs, ours):
         one, other = theirs.counts[topic], ours.counts[topic]
         if abs(one - other) > max(FEW, TOLERANCE * max(one, other)):
             found.append(f'{topic}: {one} and {other} messages')
-    if ours.status != theirs.status and theirs.status not in _CRASHES and not any(
-            each in theirs.said for each in _AFTER_THE_END):
-        found.append(f'exit status {theirs.status} and {ours.status}: {ours.said.strip()[-500:]}')
     return found
+
+
+def _is_documented(status, statuses, lines):
+    """Return whether docs/run.md says why a hosted program has a status that it never had."""
+    context_ended = any(each in line for line in lines for each in _CONTEXT_ENDED)
+    # "After Ctrl-C programs may still publish, and rclpy.shutdown does nothing": no such error
+    if status in (_OK, _INTERRUPTED) and _FAILED in statuses and context_ended:
+        return True
+    return status != 'hangs' and bool(statuses.intersection(_CRASHES))  # of the middleware
+
+
+REASONS = (
+    # rclpy's errors about a context that has ended, which a hosted program cannot have
+    *_CONTEXT_ENDED,
+    # the lines of ``mddag run`` itself
+    'warning: ', 'error: ',
+)
+"""Lines that only one kind of runs may print, and why."""
+
+
+def compare_interrupts(place, n, theirs, ours):
+    """Interrupt a program at random moments; return the differences, and how it ended."""
+    lines = {False: {*theirs.lines}, True: {*ours.lines}}
+    ends = {False: Counter([theirs.status]), True: Counter([ours.status])}
+    for _ in range(n):
+        after = LATEST_S * random.random() ** 3
+        for hosted in (False, True):
+            status, said = interrupt(place, hosted, after)
+            ends[hosted][status] += 1
+            lines[hosted] |= said
+    own = {*ends[False]}
+    found = [f'exit status {status} in {ends[True][status]} of {n + 1} runs, by itself '
+             f'{dict(ends[False])}' for status in {*ends[True]} - own
+             if not _is_documented(status, own, lines[False])]
+    found += [f'only hosted: {line[:200]!r}' for line in sorted(lines[True] - lines[False])
+              if not any(each in line for each in REASONS)]
+    return found, f'statuses {dict(ends[False])} and {dict(ends[True])}'
 
 
 def missing(program, path):
@@ -213,19 +409,25 @@ def missing(program, path):
     return done.stderr.strip().splitlines()[-1] if done.returncode else ''
 
 
-def compare(program, path, seconds):
-    """Run a program twice; return what came of it, and whether the runs differ (None: skipped)."""
+def compare(program, path, seconds, interrupts):
+    """Compare the runs of a program; return what came of it, and whether they differ."""
     why = missing(program, path)
     if why:
         return f'skipped: {why}', None
-    theirs, ours = (observe(program, path, hosted, seconds) for hosted in (False, True))
-    if theirs.end == 'by itself' and theirs.status:  # it compares nothing
-        return f'skipped: {(theirs.said.strip().splitlines() or ["it ends at once"])[-1]}', None
-    found = differences(theirs, ours)
+    with tempfile.TemporaryDirectory() as folder:
+        place = Place(program, path, folder)
+        theirs, ours = (observe(place, hosted, seconds) for hosted in (False, True))
+        if theirs.end == 'by itself' and theirs.status:  # it compares nothing
+            return f'skipped: it ends at once: {sorted(theirs.lines)[-1:]}', None
+        found = differences(theirs, ours)
+        said = f'ended {theirs.end}'
+        if interrupts:
+            more, ends = compare_interrupts(place, interrupts, theirs, ours)
+            found += more
+            said += f', {ends}'
     counts = ', '.join(f'{topic} {theirs.counts[topic]}/{ours.counts[topic]}'
                        for topic in sorted({*theirs.counts, *ours.counts}))
-    return (f'{"; ".join(found) or "same"} ({counts or "no messages"}, ended {theirs.end})',
-            bool(found))
+    return f'{"; ".join(found) or "same"} ({counts or "no messages"}, {said})', bool(found)
 
 
 def main():
@@ -233,17 +435,20 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('sources', type=Path)
     parser.add_argument('--seconds', type=float, default=5.0)
+    parser.add_argument('--interrupts', type=int, default=20)
     parser.add_argument('--only')
     options = parser.parse_args()
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     before = [os.environ['PYTHONPATH']] if os.environ.get('PYTHONPATH') else []
     differ = []
-    for program in PROGRAMS:
-        if options.only in (None, program.name):
-            path = [str((options.sources / each).resolve()) for each in program.folders] + before
-            said, differs = compare(program, path, options.seconds)
-            differ.append(differs)
-            print(f'{program.name}: {said}', flush=True)
+    with claim_domain():
+        for program in PROGRAMS:
+            if options.only in (None, program.name):
+                path = [str((options.sources / each).resolve()) for each in program.folders]
+                said, differs = compare(
+                    program, path + before, options.seconds, options.interrupts)
+                differ.append(differs)
+                print(f'{program.name}: {said}', flush=True)
     print(f'{len(differ) - differ.count(None)} programs compared, {differ.count(True)} differ')
     return 1 if any(differ) else 0
 
