@@ -108,12 +108,13 @@ def _bits(flags: Any) -> Any:
 
 
 def named(codes: Any, names: Sequence[str], known: Any = None) -> Any:
-    """Return indices of names as an Arrow array, the names as a dictionary."""
+    """Return indices of names as an Arrow array, the names as a dictionary; '' is no name."""
     import pyarrow
-    different = list(dict.fromkeys(names))
-    if len(different) < len(names):     # some numbers have the same name
+    different = list(dict.fromkeys(name for name in names if name))
+    if len(different) < len(names):     # some numbers have the same name, or none
         place = {name: i for i, name in enumerate(different)}
-        codes, names = np.array([place[name] for name in names])[codes], different
+        codes, names = np.array([place.get(name, UNKNOWN) for name in names])[codes], different
+        known = codes != UNKNOWN if known is None else known & (codes != UNKNOWN)
     texts = [name.encode('utf-8', 'backslashreplace') for name in names]
     ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
     return pyarrow.DictionaryArray.from_arrays(

@@ -21,6 +21,7 @@ from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, processes_of, Tables, Ta
 from mddag_executor.core.tables import DEMOTE, ON_LATE
 from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
+from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import Head, ReplayError
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import UNKNOWN
@@ -105,6 +106,22 @@ class Reschedule:
         return ComputedRun(
             self.task_set, self.work.load, self.log, self.decisions, end, True,
             self.work.jobs, self.settings.judge_from, self._run.run.judged_releases)
+
+    @cached_property
+    def _computed_replay(self) -> Replay:
+        return Replay(self.computed().recording(self.workers))
+
+    def table(self, name: str) -> Table:
+        """Return a table of the computed run or of its results, as ``Replay.table`` does."""
+        return self._computed_replay.table(name)
+
+    def to_arrow(self, name: str) -> Any:
+        """Return a table as an Arrow table, with names instead of numbers; see ``table``."""
+        return self._computed_replay.to_arrow(name)
+
+    def to_pandas(self, name: str) -> Any:
+        """Return a table as a pandas data frame, with names instead of numbers; see ``table``."""
+        return self._computed_replay.to_pandas(name)
 
     def result(self) -> RescheduleResult:
         """Return the result format of ``replay --json``, including the recorded run."""

@@ -11,6 +11,7 @@ from mddag_executor import replay
 from mddag_executor.analysis import result_table, tables
 from mddag_executor.analysis.result_table import result_tables
 from mddag_executor.core.tally import counts
+from mddag_executor.recording.tables import TABLES
 from msg_graph import loads
 import pytest
 
@@ -149,6 +150,14 @@ def test_columns_have_units_and_unknown_values_are_null(outcome):
     numbers, times = (get('verdicts') for get in (outcome.table, outcome.to_arrow))
     assert [time is None for time in times['completed'].to_pylist()] == (
         numbers['completed'] < 0).tolist()
+
+
+def test_categories_are_names(outcome):
+    for name in (*result_tables(), *TABLES):
+        for column in outcome.to_arrow(name).columns:
+            for chunk in getattr(column, 'chunks', ()):
+                names = getattr(chunk, 'dictionary', None)
+                assert names is None or '' not in names.to_pylist(), name
 
 
 def test_arrow_tables_have_the_same_memory():

@@ -368,6 +368,21 @@ paths:
     assert figures[2]['read', 'age'] == (20, 0, 5 * MS)     # a worker was free at 4 ms
 
 
+def test_results_of_a_what_if_are_tables(tmp_path):
+    """As those of a replay, which has them of the same run if nothing is changed."""
+    path = write_two(tmp_path / 'a.mcap')
+    for outcome in replay(path), reschedule(path):
+        verdicts = outcome.table('verdicts')
+        assert ((verdicts['completed'] - verdicts['release']) // MS).tolist() == [2, 12, 2]
+    late = reschedule(path, workers=1).table('causes')
+    assert (len(late), late['late'].tolist()) == (1, [5 * MS])
+    pytest.importorskip('pyarrow', reason='pyarrow is not installed')
+    alone = reschedule(path, workers=1)
+    assert alone.to_arrow('causes').column('behind').to_pylist() == ['/slow:cb']
+    pytest.importorskip('pandas', reason='pandas is not installed')
+    assert alone.to_pandas('causes').behind.tolist() == ['/slow:cb']
+
+
 # --- overheads -----------------------------------------------------------------------------------
 
 def test_timers_that_were_noticed_late_because_no_worker_was_idle_are_noticed_with_more(tmp_path):
