@@ -5,7 +5,7 @@ VENV := .venv
 KILTED := .venv-kilted
 # Whole files of tests that run ROS come first, then the others one by one (see test/conftest.py).
 PYTEST_ARGS ?= -n 2
-TEST_TAKES := 6 minutes on two cores
+TEST_TAKES := 8 minutes on two cores
 BIN := $(VENV)/bin
 
 # The environment brings its own ROS packages. What a sourced ROS (or another environment's

@@ -192,6 +192,12 @@ def test_the_site_builds_without_warnings_and_needs_no_network(tmp_path):
         assert f'{name}' in api
 
 
+def test_the_readme_leads_to_every_page():
+    links = set(re.findall(r'\]\(docs/(\w+\.md)', (TOP / 'README.md').read_text(encoding='utf-8')))
+    pages_of_the_site = {page.name for page in (TOP / 'docs').glob('*.md')}
+    assert pages_of_the_site - links == {'index.md'}
+
+
 def test_images_and_links():
     texts = {page: (TOP / page).read_text(encoding='utf-8') for page in PAGES}
     for path in (TOP / 'docs' / 'images').iterdir():
