@@ -30,7 +30,6 @@ import numpy as np
 SAME_CLOCK = 500_000_000
 SAME_PUBLICATION = 10_000_000
 
-HOST = 'mddag:host'
 _NODES = ('ros2:rcl_publisher_init', 'ros2:rcl_subscription_init')
 _PUBLISH, _TAKE = 'ros2:rclcpp_publish', 'ros2:rmw_take'
 _COLUMNS = {

@@ -5,12 +5,12 @@ The clocks of the computers of an imported recording.
 
 Theory of operation
 -------------------
-A recording does not say which processes ran on one computer.
+A recording of LTTng says which processes ran on one computer (`mddag:host`), others do not.
 
 1. On one clock no message is received before it was published.  If none is, all processes are
    assumed to have one clock, and times are left as they are.
-2. Otherwise processes are grouped into machines, those with the shortest messages first, so that
-   no message within a machine is received before it was published.
+2. Otherwise processes are grouped into machines: those of one computer first, then those with the
+   shortest messages, so that no message within a machine is received before it was published.
 3. The offsets of the machines from the one with the most executions are estimated from messages in
    both directions (``clocks``).  Events of a machine with a known offset are moved to its clock.
 4. Messages between machines without a known offset are *distrusted*: an execution that one of
@@ -19,7 +19,7 @@ A recording does not say which processes ran on one computer.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 
 from mddag_executor.recording.columns import Ints, Mask
@@ -34,10 +34,11 @@ class ImportedClocks:
     """
     The clocks of the processes of a recording.
 
+    :param hosts: by process id its computer, if it is known.
     :ivar shift: by process id what is added to its times, ns; without those that do not change.
     """
 
-    def __init__(self, links: Links) -> None:
+    def __init__(self, links: Links, hosts: Mapping[int, str]) -> None:
         self._links = links
         runs, messages = links.runs, links.messages
         pids, which = different(np.array([pid for pid, _ in links.threads], dtype=np.int64))
@@ -53,7 +54,7 @@ class ImportedClocks:
         self._machine = list(range(len(self._pids)))
         self._offsets: dict[int, clocks.Offset] = {}
         if any(least < 0 for least in self._ways.values()):
-            self._find_machines()
+            self._find_machines(hosts)
 
     def _least(self, sends: Ints, receives: Ints) -> clocks.Ways:
         """Return the minimum time of messages from one process or machine to another."""
@@ -66,10 +67,17 @@ class ImportedClocks:
             found[pair >> 32, pair & 0xFFFFFFFF] = latency
         return found
 
-    def _find_machines(self) -> None:
+    def _find_machines(self, hosts: Mapping[int, str]) -> None:
         """Group the processes into machines (rule 2), and find their offsets (rule 3)."""
         machine = self._machine
         apart = {pair for pair, least in self._ways.items() if least < 0}
+        # a computer with messages that are received before they were published has no one clock
+        odd = {hosts[self._pids[a]] for a, b in apart
+               if hosts.get(self._pids[a], a) == hosts.get(self._pids[b], b)}
+        first: dict[str, int] = {}
+        for place, pid in enumerate(self._pids):
+            if pid in hosts and hosts[pid] not in odd:
+                machine[place] = first.setdefault(hosts[pid], place)
         for (a, b), least in sorted(self._ways.items(), key=lambda way: way[1]):
             both = {machine[a], machine[b]}
             if least >= 0 and not any({machine[x], machine[y]} == both for x, y in apart):

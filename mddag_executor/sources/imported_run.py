@@ -48,6 +48,7 @@ from mddag_executor.sources.imported_jobs import ImportedJobs
 from mddag_executor.sources.links import Links, Oddities
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
+from mddag_executor.trace.schema import HOST
 from mddag_executor.trace.times import credible
 from msg_graph import Process, TaskSet
 import numpy as np
@@ -72,7 +73,7 @@ class ImportedRun:
     """
 
     kinds = KINDS
-    others: Sequence[str] = (*INIT_EVENTS, *_OWN)
+    others: Sequence[str] = (*INIT_EVENTS, *_OWN, HOST)
     links_type = Links
     odd = OFF_THE_GRID
 
@@ -92,7 +93,8 @@ class ImportedRun:
         if head is None and (own or not len(starts)):
             raise no_run(reader)
         self._link()
-        self._clocks = ImportedClocks(self.links)
+        self._clocks = ImportedClocks(self.links, {
+            event[2]: str(event[4:]) for event in self._events.others if event[0].name == HOST})
         if self._clocks.shift:
             self._events = moved(self._events, self._clocks.shift)
             self._link()

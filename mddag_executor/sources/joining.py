@@ -54,7 +54,7 @@ from mddag_executor.sources.own import begin_of, end_losses, Read, read_process
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.numbers import Numbers
-from mddag_executor.trace.schema import EVENTS
+from mddag_executor.trace.schema import EVENTS, HOST
 from msg_graph import Dag, Process
 import numpy as np
 
@@ -113,9 +113,9 @@ class _Part:
                 'other traces know', 'replay it by itself, with a GRAPH')
         self.head: Head = head
         last = {event[0]: event[4:] for event in self.reader.events(
-            {_INIT, clocks.HOST, _SHUTDOWN, _JUDGE_FROM}) if None not in event}
+            {_INIT, HOST, _SHUTDOWN, _JUDGE_FROM}) if None not in event}
         self.clock: int = last.get(_INIT, (0,))[0]
-        self.boot: str = last.get(clocks.HOST, ('', ''))[1]
+        self.boot: str = last.get(HOST, ('', ''))[1]
         self.end: int | None = last.get(_SHUTDOWN, (None,))[0]
         self.judges_from: int = last.get(_JUDGE_FROM, (0,))[0]
         self.shift = self.last = 0

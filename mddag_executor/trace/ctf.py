@@ -23,8 +23,9 @@ Theory of operation:
    `_` appended.
 4. The contexts `vpid` and `vtid` become the preamble.  Events of one host and process id belong to
    one process, in whichever session they are.  If several hosts have the same ids, those of later
-   hosts and containers are changed (`numbers`).  An event `mddag:process` with `procname` precedes
-   the first event of a thread, and each change of its name.
+   hosts and containers are changed (`numbers`).  An event `mddag:host` precedes the first event of
+   a process, if the metadata names its host, and an event `mddag:process` with `procname` the
+   first event of a thread, and each change of its name.
 5. Events discarded by the tracer become an event `mddag:lost` at the end of the gap; a lost packet
    counts as at least one event, and a warning reports it.  So does damage.
 6. A tracepoint writes to all sessions that record it before its thread goes on.  So an event that
@@ -66,6 +67,7 @@ from mddag_executor.trace.schema import (
     BEFORE_HUMBLE_REMEDY,
     EVENTS,
     EventType,
+    HOST,
     PREAMBLE,
     PROCESS,
 )
@@ -155,9 +157,11 @@ def _written(
     """Write the sessions of some hosts into a trace."""
     with whole_trace(output, overwrite) as part, TraceFile(part, overwrite=True) as file:
         importer = _Importer(name, file)
-        for sessions in hosts:
+        known = [sessions[0].host for sessions in hosts]
+        for sessions, host in zip(hosts, known):
             several = sum(each.parts for each in sessions) > 1
-            importer.begin(several)
+            # sessions that name one host, but contradict each other, are of unknown hosts
+            importer.begin(several, host if host[1] and known.count(host) == 1 else None)
             reading = Reading({folder: metadata for each in sessions
                                for folder, metadata in each.traces.items()}, raw=several)
             for events, lost in reading.batches():
@@ -356,18 +360,22 @@ class _Importer:
         self._processes, self._threads = Numbers(), Numbers()
         self._targets: dict[int, _Target] = {}      # by identity of the kind
         self._names: set[str] = set()               # of events
+        self._host: _Host | None = None
+        self._hosted: set[int] = set()              # processes of which the host is written
         self._procnames: dict[int, bytes] = {}      # by process and thread in one number
         self._nameless = 0                          # events without process or thread
         self._impossible = 0                        # events of impossible processes or threads
         self._uncounted = 0                         # gaps of an unknown number of events
 
-    def begin(self, several: bool) -> None:
+    def begin(self, several: bool, host: _Host | None) -> None:
         """
         Begin with the next host.
 
         :param several: whether it has several sessions.
+        :param host: what it is called; None: unknown.
         """
         self._place += 1
+        self._host = host
         self._repeated += self._several.repeated if self._several else 0
         self._several = _Several() if several else None
 
@@ -387,18 +395,22 @@ class _Importer:
         vtid = self._numbered(self._threads, which, events.vtid)
         self.result.events += len(events)
         self.result.processes.update(np.unique(vpid).tolist())
+        met = self._met(vpid)
         renamed, names = self._renamed(vpid, vtid, events.procname)
         gaps = sorted(lost)
-        # names come just before their events, gaps after all that is not later
+        # hosts and names come just before their events, gaps after all that is not later
         keys = np.concatenate((
-            4 * np.arange(len(events)) + 2, 4 * renamed + 1,
+            4 * np.arange(len(events)) + 2, 4 * met + 1, 4 * renamed + 1,
             4 * np.searchsorted(events.time, [gap.time for gap in gaps], side='right')))
         order = np.empty(len(keys), dtype=np.int64)
         order[np.argsort(keys, kind='stable')] = np.arange(len(keys))
-        of_events, of_names, of_gaps = np.split(
-            order, [len(events), len(events) + len(renamed)])
-        tables = [Columns(PROCESS, of_names, events.time[renamed], vpid[renamed], vtid[renamed],
-                          [(name,) for name in names]), self._gaps(gaps, of_gaps)]
+        of_events, of_hosts, of_names, of_gaps = np.split(order, np.cumsum([
+            len(events), len(met), len(renamed)]))
+        tables = [Columns(HOST, of_hosts, events.time[met], vpid[met], vtid[met],
+                          [self._host or ('', '')] * len(met)),
+                  Columns(PROCESS, of_names, events.time[renamed], vpid[renamed], vtid[renamed],
+                          [(name,) for name in names]),
+                  self._gaps(gaps, of_gaps)]
         merged: dict[str, list[Columns]] = {}
         for number, rows in enumerate(events.tables):
             if rows.count:
@@ -435,6 +447,15 @@ class _Importer:
             event = first[at]
             found[at] = numbers.of((self._place, int(which[event])), int(ids[event]))
         return found[inverse]
+
+    def _met(self, vpid: Ints) -> Ints:
+        """Return the first events of processes whose host is known and not written yet."""
+        if self._host is None:
+            return np.zeros(0, dtype=np.int64)
+        pids, first = np.unique(vpid, return_index=True)
+        new = np.array([pid not in self._hosted for pid in pids.tolist()], dtype=np.bool_)
+        self._hosted.update(pids.tolist())
+        return np.sort(first[new])
 
     def _renamed(self, vpid: Ints, vtid: Ints, procname: Array) -> tuple[Ints, list[str]]:
         """Return the events before which their thread has a new name, and the names."""

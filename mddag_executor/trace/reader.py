@@ -25,7 +25,7 @@ from mddag_executor.trace.errors import TraceError, TraceWarning, unreadable
 from mddag_executor.trace.events import Batch, Event
 from mddag_executor.trace.reading import Messages, Reading
 from mddag_executor.trace.records import LIBRARY
-from mddag_executor.trace.schema import PROCESS
+from mddag_executor.trace.schema import HOST, PROCESS
 
 
 def _opened(path: str) -> BinaryIO:
@@ -196,8 +196,8 @@ def read_events(path: str | os.PathLike[str],
 
     Each event is a dict of `_name` (as in `ros2:callback_start`), `_timestamp` (ns), `_vpid`,
     `_vtid` and the event's fields in the file. In an imported recording it also has `_procname`:
-    the events `mddag:process` that hold it are only yielded if they are named. A `TraceWarning` at
-    the end reports missing data.
+    the events `mddag:process` that hold it, and `mddag:host`, are only yielded if they are named.
+    A `TraceWarning` at the end reports missing data.
 
     :param names: full names of the wanted events, None for all
     :raises TraceError: if the file cannot be read
@@ -210,8 +210,8 @@ def read_events(path: str | os.PathLike[str],
         values = dict(zip(layout.fields, fields))
         if layout.name == PROCESS:
             named[vpid, vtid] = {'_procname': values.get('procname', '')}
-            if wanted is None or PROCESS not in wanted:
-                continue
+        if layout.name in (PROCESS, HOST) and (wanted is None or layout.name not in wanted):
+            continue
         yield {'_name': layout.name, '_timestamp': timestamp, '_vpid': vpid, '_vtid': vtid,
                **named.get((vpid, vtid), {}), **values}
     for text in reader.warnings:

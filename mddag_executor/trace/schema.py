@@ -140,7 +140,8 @@ _ALL = (
     _event('mddag', 'task_set', (0, 0), yaml=_STR, file=_STR, policy=_STR, workers=_I32,
            default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL, cpus=_I32,
            on_late=_I32),
-    # the boot of the machine that the steady clock counts from, '': unknown
+    # the boot of the machine that the steady clock counts from, '': unknown; `import ctf` writes
+    # one for each process
     _event('mddag', 'host', name=_STR, boot=_STR),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     _event('mddag', 'judge_from', release=_I64),
@@ -174,3 +175,4 @@ _ALL = (
 EVENTS = {event.key: event for event in _ALL}
 
 PROCESS = 'mddag:process'
+HOST = 'mddag:host'

@@ -28,6 +28,7 @@ from msg_graph import GraphError, loads
 import pytest
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
+from ..trace.ctf2 import to_ctf2
 from ..trace.ctf_session import session
 from ..trace.helpers import records_of
 from .bags import write_bag
@@ -234,14 +235,17 @@ def test_damaged_bags(tmp_path, storage, compression):
             assert bag.warnings or found == whole
 
 
-@pytest.mark.parametrize('head', ['plain', 'compact', 'large'])
-def test_damaged_ctf_sessions(head, tmp_path):
+@pytest.mark.parametrize(('head', 'metadata'), [
+    ('plain', 'CTF 1.8'), ('compact', 'CTF 1.8'), ('large', 'CTF 1.8'), ('compact', 'CTF 2')])
+def test_damaged_ctf_sessions(head, metadata, tmp_path):
     """What is cut is missing with a warning; no damage is more than one line."""
     kinds = [*((f'ros2:callback_{what}', [('callback', 'u64')]) for what in ('start', 'end')),
              ('my:text', [('label', 'str'), ('values', 'u8[]')])]
     folder = session(tmp_path / 'session', kinds, [
         (at % 3, at * 2 ** 25, 1, 1, 'p', *([0x5550] if at % 3 < 2 else ['label', [1, 2]]))
         for at in range(60)], head=head, packets=[0, 1, 2])
+    if metadata == 'CTF 2':
+        to_ctf2(folder, packets=True)
     files = {name: (folder / name).read_bytes() for name in ('metadata', 'channel_0')}
     trace = tmp_path / 'trace.mcap'
 

@@ -187,9 +187,22 @@ def test_an_execution_that_is_late_by_nearly_a_period(starts, tmp_path):
     assert [line for line in warnings if 'off the grid' in line] == []
 
 
-def two_computers(path, skew=0, back=False, ways=2 * MS):
-    """Write a camera, and on another computer, whose clock is behind, what detects and plans."""
+SHOW = 17
+
+
+def two_computers(path, skew=0, back=False, ways=2 * MS, hosts=None):
+    """
+    Write a camera, and on another computer, whose clock is behind, what detects and plans.
+
+    :param hosts: the names of the computers of three processes, of which the last, on the other
+        computer as well, only shows images: no messages both ways say how its clock differs.
+    """
     r = Recorded(path)
+    for pid, host in enumerate(hosts or (), 1):
+        r.add('mddag:host', 0, 1, host, f'boot of {host}', pid=pid)
+    if hosts:
+        r.node(3, '/show', pid=3)
+        r.subscription(SHOW, 3, '/image', time=-skew, pid=3)
     r.node(1, '/camera')
     r.node(2, '/detect', pid=2)
     r.timer(GRAB, 1, 100 * MS)
@@ -202,6 +215,8 @@ def two_computers(path, skew=0, back=False, ways=2 * MS):
         r.run(GRAB, 1, at, at + 2 * MS)
         image = r.publish(IMAGE, 1, at + MS)
         r.receive(DETECT, 2, at + MS + ways - skew, at + MS + ways + 4 * MS - skew, image, pid=2)
+        if hosts:
+            r.receive(SHOW, 3, at + MS + ways - skew, at + MS + ways + MS - skew, image, pid=3)
         if back:
             boxes = r.publish(BOXES, 2, at + 5 * MS - skew, pid=2)
             r.receive(PLAN, 1, at + 5 * MS + ways, at + 5 * MS + ways + MS, boxes)
@@ -214,6 +229,9 @@ nodes:
   - {node: /camera, callbacks: [{name: grab, timer: 100ms, publishes: [/image]},
                                 {name: plan, subscription: /boxes, deadline: 10ms}]}
   - {node: /detect, callbacks: [{name: run, subscription: /image, publishes: [/boxes]}]}
+"""
+SHOWN = """\
+  - {node: /show, callbacks: [{name: show, subscription: /image, deadline: 10ms}]}
 """
 
 
@@ -230,6 +248,17 @@ def test_messages_both_ways_show_how_clocks_of_two_computers_differ(tmp_path, sk
     for key in ('dags', 'communications', 'callbacks', 'duration_ns'):
         assert result[key] == sound[key], key
     assert result['dags']['/camera']['sinks']['/camera:plan']['completed'] == 10
+
+
+def test_processes_of_one_computer_have_one_clock(tmp_path):
+    """LTTng says the computer of each process; otherwise it shows only in messages."""
+    graph = loads(TWO + SHOWN, 'graph.yaml')
+    for hosts, judged in (('one', 'two', 'two'), 10), (('one', 'two', 'three'), 0):
+        path = two_computers(tmp_path / f'{hosts[2]}.mcap', 5 * MS, back=True, hosts=hosts)
+        result, warnings = result_of(path, graph)
+        shown = result['dags']['/camera']['sinks']['/show:show']
+        assert shown['completed'] == judged, warnings
+        assert any('clocks of computers differ' in line for line in warnings) == (not judged)
 
 
 @pytest.mark.parametrize('skew', [3 * MS, 5 * MS, 400 * MS])

@@ -181,6 +181,25 @@ def test_fields_of_all_types(head, tmp_path):
     assert contents(tmp_path / 'ctf2.mcap') == contents(tmp_path / 'out.mcap')
 
 
+def test_the_host_of_each_process_is_known(tmp_path):
+    """By the name of the host and the UUID of its clock, which is that of its boot."""
+    folders = [session(
+        tmp_path / name, [START], [(0, 10 + k, pid, pid, 'p', k, 0) for k in range(3)
+                                   for pid in (7, 8)], environment={'hostname': name}, boot=boot)
+               for name, boot in (('arm', 'a-1'), ('base', 'b-2'))]
+    to_ctf2(folders[1])
+    for given, hosts in ((folders, [('arm', 'a-1')] * 2 + [('base', 'b-2')] * 2),
+                         (folders[:1], [('arm', 'a-1')] * 2)):
+        import_ctf(given, tmp_path / 'out.mcap', overwrite=True)
+        events = list(TraceReader(tmp_path / 'out.mcap').events({'mddag:host', START[0]}))
+        found = [event for event in events if event[0] == 'mddag:host']
+        assert [event[4:] for event in found] == hosts
+        assert len({event[2] for event in found}) == len(hosts)
+        for host in found:
+            assert next(event for event in events if event[2] == host[2]) == host
+        assert all(event['_name'] == START[0] for event in read_events(tmp_path / 'out.mcap'))
+
+
 def test_an_array_without_elements_is_aligned(tmp_path):
     """As babeltrace2 reads it; LTTng aligns the elements of some processors."""
     wide = 'integer { size = 64; align = 64; }'
