@@ -276,7 +276,7 @@ def rescheduled(path, arrivals, storage=MCAP):
     # a message further away is there alone: one more stretch of time, with one job at most
     assert jobs[1] <= (1 * S + times.GAP_NS) // TIMER + 2
     assert len(outcome.decisions) <= 2 * sum(jobs)
-    assert len(outcome.log) <= 2 * (2 * jobs[0] + jobs[1])
+    assert sum(kind == START for _, kind, *_ in outcome.log) <= 2 * jobs[0] + jobs[1]
     return outcome
 
 
