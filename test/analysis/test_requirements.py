@@ -9,7 +9,7 @@ import re
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor import replay
+from mddag_executor import replay, reschedule
 from mddag_executor.analysis.paths import Flows
 from mddag_executor.analysis.requirements import Requirements
 from mddag_executor.core.state import SINK_IN_TIME, SINK_LATE, SINK_MISSED, SINK_NOT_DUE
@@ -138,6 +138,21 @@ def test_what_waited_at_the_end_was_no_input(tmp_path):
     trace.add('dispatch', 100, 1000, 0, 0, 1, -1, ns(10), 0)
     found = replay(trace.end(100)).result()['requirements']['imu_to_wheels']['reaction']
     assert (found['completed'], found['late']) == (0, 0)
+
+
+def test_what_is_published_early_is_rescheduled_as_it_was(tmp_path):
+    """Another worker runs the callback that a message starts before the publisher has ended."""
+    trace = Written(tmp_path / 'r.mcap', GRAPH, workers=2)
+    for job, at in enumerate((0, 20, 40)):
+        trace.release(0, job, at)
+        trace.run(0, 0, job, at, at + 5)
+        trace.run(0, 1, job, at + 2, at + 4, worker=1)
+        trace.release(1, job, at + 10)
+        trace.run(1, 0, job, at + 10, at + 13)
+        trace.run(1, 1, job, at + 11, at + 12, worker=1)
+    path = trace.end(60)
+    for result in replay(path).result(), reschedule(path, workers=2).result():
+        assert counts(result) == {'reaction': (0, 2, 0, 0, 32), 'age': (3, 0, 0, 0, 12)}
 
 
 def test_outputs_that_do_not_come_for_years_are_only_counted(tmp_path):
