@@ -166,8 +166,8 @@ def main() -> None:
             times = responses.get(name, [])
             print(f'{name}: itself {len(times)} results, '
                   f'{sum(t > deadline_ms for t in times)} late; judged {sink["completed"]} '
-                  f'results, {sink["late"]} late, {sink.get("not_due", 0)} not due '
-                  f'in {dag["jobs"]} jobs')
+                  f'results, {sink["late"]} late, {sink.get("not_due", 0)} not due, '
+                  f'{sink["expired"]} expired in {dag["jobs"]} jobs')
     required = executor.statistics()['requirements']
     age, ages = required['imu_to_plan']['age'], responses['/planner:imu']
     print(f'imu_to_plan: itself {len(ages)} outputs, the oldest {max(ages):.0f} ms; judged '

@@ -79,7 +79,8 @@ REMEDIES = {
                '`keep: newest`); a late release of a timer is dropped when its next one is '
                'ready: less load, or a longer deadline',
     'destroyed': 'keep the node and its subscription until the job has ended',
-    'not published': 'publish in each execution of the callback before it',
+    'not published': 'publish in each execution of the callback before it, or declare the topic '
+                     'under `may_publish`',
     'lost': 'reliable QoS or a longer queue (QoS depth); if a process ended early (see the '
             'warnings), its end',
     'failed': 'mend what the callback raises',

@@ -140,19 +140,20 @@ def test_ordinary_robot():
     assert all(int(n) >= 3 for n in re.findall(r'\d+', reaction))
     found = {m[1]: tuple(map(int, m.groups()[1:])) for m in map(re.compile(
         r'(\S+): itself (\d+) results, (\d+) late; judged (\d+) results, (\d+) late, '
-        r'(\d+) not due in (\d+) jobs').fullmatch, lines)}
+        r'(\d+) not due, (\d+) expired in (\d+) jobs').fullmatch, lines)}
     assert set(found) == {
         '/brake:stop', '/planner:plan', '/tracker:track', '/panel:lamp', '/panel:pressed'}
-    own, own_late, completed, late, _, _ = found.pop('/tracker:track')
+    own, own_late, completed, late, *_ = found.pop('/tracker:track')
     # on a busy machine the fusion skips a scan, which completes with the next one
     assert own >= 3 and abs(own - completed) <= 2 and own_late <= late
-    for own, own_late, completed, late, _, _ in found.values():
+    for own, own_late, completed, late, *_ in found.values():
         assert 0 <= own - completed <= 1    # one may have expired on a busy machine
         assert own_late <= late     # the verdicts also count how late a timer was
-    own, own_late, _, _, not_due, jobs = found['/brake:stop']
+    own, own_late, _, _, not_due, expired, jobs = found['/brake:stop']
     assert own_late >= 1
-    assert 0 <= jobs - own - not_due <= 3 and not_due >= own   # so many are open at the end
-    assert found['/panel:lamp'][0] == found['/panel:lamp'][5] == 1
+    # releases that the camera skips on a busy machine expire; so many are open at the end
+    assert -1 <= jobs - own - not_due - expired <= 3 and not_due >= own
+    assert found['/panel:lamp'][0] == found['/panel:lamp'][-1] == 1
     assert found['/panel:pressed'][0] >= 1
 
 
