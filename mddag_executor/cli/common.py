@@ -256,13 +256,18 @@ def show(
     """
     Write a result to the file of `--json`, and print its lines if people read the output.
 
+    The lines are also printed if the file cannot be written: a run is not lost with it.
+
     :param tables_to_stderr: if the file of `--output` is standard output, print the lines on
         standard error.
     """
     tables_to_stderr = tables_to_stderr and args.output == '-' and not is_quiet()
-    if write_result(args, result) or tables_to_stderr:
-        for line in lines:
-            print(line, file=sys.stderr if tables_to_stderr else sys.stdout)
+    try:
+        write_result(args, result)
+    finally:
+        if wants_tables(args) or tables_to_stderr:
+            for line in lines:
+                print(line, file=sys.stderr if tables_to_stderr else sys.stdout)
 
 
 def wants_tables(args: argparse.Namespace) -> bool:

@@ -112,7 +112,7 @@ def _late_priority(t: Tables, s: State, x: int, now: int) -> int:
             release < 0 or s.queue_demoted[queue] < release):
         release = s.queue_demoted[queue]
     if release < 0:
-        release = now + LATE_PATIENCE * t.dag_deadline[t.dag_of[vertex]]
+        release = now + LATE_PATIENCE * t.late_deadline[t.dag_of[vertex]]
     if s.job_demoted[slot] < 0:
         s.job_demoted[slot] = release
     if queue >= 0:

@@ -57,7 +57,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     that comes first is *late* if none of its executions can be in time at any of their sinks: the
     time plus the mean execution times on the longest path to the sink is past its deadline.  Until
     one of its executions starts, a late queue counts as released ``LATE_PATIENCE`` relative
-    deadlines later, and so does the job of its first execution at all later vertices.  So late
+    deadlines later, and so does the job of its first execution at all later vertices.  (In a DAG
+    without any deadline it does not: its relative deadline is ten periods already.)  So late
     work ages, and each callback gets some time.  As long as another execution in the queue can be
     in time, the queue has the place of the first such execution, by the earliest deadline that
     this one can meet.  So a backlog is worked off.  In a lasting overload

@@ -22,6 +22,8 @@ The offsets are relative to a job's release:
 deadline, of any other vertex the least among the sinks that it leads to (Yano and Azumi, RTSS 2024
 WiP, extended GEDF).
 * ``dag_deadline``: the latest deadline of the DAG (GEDF with one deadline for each DAG).
+* ``late_deadline``: the same for how long late work is put off; 0 of a DAG without any deadline,
+  as its work has been put off by ``UNJUDGED_PERIODS`` already.
 * ``latest_start``: the latest start of the vertex with which every sink that it leads to is in
 time, if each vertex takes its mean execution time (0 if none is declared) and never waits: the
 least difference of these sinks' deadlines and the longest paths to them (least laxity first).
@@ -108,6 +110,7 @@ class Tables(NamedTuple):
     n_vertices: int
     period: list[int]
     dag_deadline: list[int]
+    late_deadline: list[int]
     on_late: list[int]
     max_active_jobs: list[int]
     expire_after: list[int]
@@ -268,6 +271,7 @@ class _Columns:
         leaves = [vertex for vertex in dag.vertices if not vertex.successors]
         judged = [dag.vertices[sink] for sink in dag.sinks]
         lists['dag_deadline'].append(max(leaf_deadline(v, dag) for v in judged or leaves))
+        lists['late_deadline'].append(lists['dag_deadline'][-1] if judged else 0)
         lists['on_late'].append(self._on_late if dag.on_late is None else ON_LATE[dag.on_late])
         lists['max_active_jobs'].append(dag.max_active_jobs or self._max_active_jobs)
         lists['expire_after'].append(self._expire_after)
@@ -312,7 +316,8 @@ class _Columns:
             'n_legs': 1, 'first_leg': self._n_queues,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),
             'driven': 0, 'first_gate': len(lists['gates']), 'group': -1, 'process': 1,
-            'period': default_deadline, 'dag_deadline': default_deadline, 'on_late': self._on_late,
+            'period': default_deadline, 'dag_deadline': default_deadline,
+            'late_deadline': default_deadline, 'on_late': self._on_late,
             'max_active_jobs': NEVER, 'expire_after': NEVER, 'first_vertex': n_vertices,
             'n_region': 1, 'source': n_vertices, 'first_sink': len(lists['sinks']),
         }

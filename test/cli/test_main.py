@@ -181,6 +181,14 @@ def test_a_full_disk_is_one_line(how, place):
         2, f'error: {place}: no space left on device: free space, or name another file\n')
 
 
+@pytest.mark.skipif(not Path('/dev/full').exists(), reason='this system has no /dev/full')
+def test_a_result_that_cannot_be_written_is_still_shown(call):
+    done = call('graph', 'check', AUTOWARE, '--json', '/dev/full')
+    assert done.returncode == 2 and done.stderr.endswith(
+        'error: /dev/full: no space left on device: free space, or name another file\n')
+    assert done.stdout == call('graph', 'check', AUTOWARE).stdout
+
+
 @pytest.mark.parametrize('closed', ['<&- >&-', '2>&-', '<&- >&- 2>&-'])
 def test_closed_streams(folder, closed):
     """Nothing is printed, also not into files that are written."""

@@ -4,8 +4,10 @@
 
 import errno
 import os
+from pathlib import Path
 import resource
 
+from mddag_executor import open_recording
 import pytest
 
 GRAPH = """\
@@ -71,3 +73,21 @@ def test_a_disk_that_gets_full_is_one_line_and_leaves_nothing(graph, call, mddag
     assert done.stderr.startswith(f'error: {command.split()[-1]}: ')
     assert os.strerror(errno.EFBIG)[1:] in done.stderr
     assert 'trace' not in done.stdout and sorted(graph.parent.iterdir()) == before
+
+
+def test_a_timer_without_a_deadline_starts_within_ten_of_its_periods(call, folder):
+    """Also if all others are always late: its place among them is that of a late one already."""
+    Path('g.yaml').write_text("""\
+mddag: 1
+workers: 1
+nodes:
+  - {node: /heavy, callbacks: [{name: t, timer: 10ms, deadline: 10ms, execution_time: 12ms}]}
+  - {node: /mission, callbacks: [{name: t, timer: 1s, deadline: none, execution_time: 1ms}]}
+""")
+    done = call('simulate', 'g.yaml', '--duration', '50s', '--on-late', 'demote',
+                '--trace', 'r.mcap')
+    assert done.returncode == 0
+    run = open_recording('r.mcap')
+    mine = run.executions[(run.executions['dag'] == 1) & (run.executions['worker'] >= 0)]
+    starts = [run.start, *mine['start'].tolist(), run.end]
+    assert max(after - before for before, after in zip(starts, starts[1:])) <= 11.1e9
