@@ -62,7 +62,10 @@ def test_late_jobs_are_rescheduled_as_they_were_treated(call, graph, on_late):
     ('simulate graph.yaml --duration 20s --trace out.mcap', 100_000),
     ('export run.mcap -o tables/', 1_000), ('export run.mcap -o out.csv', 1_000),
     ('generate --sets 3 -o sets', 1_000)])
-def test_a_disk_that_gets_full_is_one_line_and_leaves_nothing(graph, call, mddag, command, most):
+def test_a_disk_that_gets_full_is_one_line_and_leaves_nothing(
+        graph, call, mddag, command, most, monkeypatch):
+    # else Python would leave only the begin of compiled modules in __pycache__
+    monkeypatch.setenv('PYTHONDONTWRITEBYTECODE', '1')
     if 'tables' in command:
         pytest.importorskip('pyarrow', reason='pyarrow is not installed')
     assert call('simulate', graph, '--duration', '2s', '--trace', 'run.mcap').returncode == 0
