@@ -23,7 +23,8 @@ It is less if the ready one is urgent: its relative deadline by ``PATIENCE_PART`
 than ``LEAST_PATIENCE_NS``.  A callback that holds the interpreter is checked then, and once more
 after half of that time.  So what has a relative deadline of 20 ms starts 0.9 ms after it became
 ready, if the callback before it was expected to end, but waits.  With 40 and 0.4 ms it would be
-0.75 ms, but on a busy machine 0.8 more context switches for each message of 15 ms were counted.
+0.75 ms.  More context switches were seen with these, in runs on a busy machine that also differed
+in other ways.
 """
 
 PATIENCE_PART = 33
