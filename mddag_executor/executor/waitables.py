@@ -234,7 +234,8 @@ class WaitableSource(ChannelSource):
         new = None if before is None else [each.rclpy_object for each in self._without(before)]
         with self._lock:  # announcements meanwhile must not also fill the wait set
             self._set.parts(lambda kind, address: set_listener(kind, address, self.fd), new)
-        if self._has_more:
+        # what ``before`` was about to be asked for, it is not asked for any more
+        if self._has_more or before is not None:
             self._ask()
 
     def _without(self, other: WaitableSource | None) -> list[Entity]:

@@ -157,6 +157,32 @@ def test_an_event_keeps_its_change_when_others_are_created(make_executor, make_n
     assert seen == [(1, 1), (2, 1), (3, 1)]
 
 
+def test_an_event_is_taken_that_was_announced_before_others_were_created(
+        make_executor, make_node, monkeypatch):
+    """Its thread had not asked for it yet when the shared source was made again."""
+    node, other, seen, held = make_node(), make_node('other'), [], []
+    node.create_publisher(Header, '/topic', 10, event_callbacks=PublisherEventCallbacks(
+        matched=lambda info: seen.append(info.current_count_change)))
+    executor = make_executor(nodes=[node])
+    executor.spin_once(0.0)
+
+    def spin_until(done):
+        end = time.monotonic() + 15
+        while not done() and time.monotonic() < end:
+            executor.spin_once(0.1)
+        return done()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EventsSource, 'collect', lambda self: held.append(self._ask))
+        other.create_subscription(Header, '/topic', print, 10)
+        assert spin_until(lambda: held)
+    node.create_subscription(Header, '/another', print, 10)
+    executor.spin_once(0.1)
+    for ask in held:
+        ask()
+    assert spin_until(lambda: seen) and seen == [1]
+
+
 def test_the_middleware_writes_to_no_file_after_the_executor_has_ended(
         make_executor, make_node, tmp_path):
     """Not even if the event of another subscription has just been destroyed."""
