@@ -157,12 +157,13 @@ def test_an_event_keeps_its_change_when_others_are_created(make_executor, make_n
     assert seen == [(1, 1), (2, 1), (3, 1)]
 
 
-def test_an_event_is_taken_that_was_announced_before_others_were_created(
+def test_an_event_is_taken_that_was_announced_before_another_was_destroyed(
         make_executor, make_node, monkeypatch):
     """Its thread had not asked for it yet when the shared source was made again."""
     node, other, seen, held = make_node(), make_node('other'), [], []
     node.create_publisher(Header, '/topic', 10, event_callbacks=PublisherEventCallbacks(
         matched=lambda info: seen.append(info.current_count_change)))
+    another = node.create_subscription(Header, '/another', print, 10)
     executor = make_executor(nodes=[node])
     executor.spin_once(0.0)
 
@@ -176,7 +177,7 @@ def test_an_event_is_taken_that_was_announced_before_others_were_created(
         patch.setattr(EventsSource, 'collect', lambda self: held.append(self._ask))
         other.create_subscription(Header, '/topic', print, 10)
         assert spin_until(lambda: held)
-    node.create_subscription(Header, '/another', print, 10)
+    node.destroy_subscription(another)
     executor.spin_once(0.1)
     for ask in held:
         ask()
