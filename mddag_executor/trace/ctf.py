@@ -162,8 +162,12 @@ def _written(
             several = sum(each.parts for each in sessions) > 1
             # sessions that name one host, but contradict each other, are of unknown hosts
             importer.begin(several, host if host[1] and known.count(host) == 1 else None)
-            reading = Reading({folder: metadata for each in sessions
-                               for folder, metadata in each.traces.items()}, raw=several)
+            try:
+                reading = Reading({folder: metadata for each in sessions
+                                   for folder, metadata in each.traces.items()}, raw=several)
+            except MetadataError as error:
+                raise TraceError(
+                    name, f'its metadata cannot be read ({error})', _RECORD) from None
             for events, lost in reading.batches():
                 importer.take(events, lost)
                 if progress is not None:

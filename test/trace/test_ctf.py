@@ -420,6 +420,14 @@ def test_ctf2_that_is_cut_is_one_error(text, says, tmp_path):
         import_ctf(tmp_path, tmp_path / 'out.mcap')
 
 
+def test_heads_of_events_that_overlap_are_one_error(tmp_path):
+    folder = session(tmp_path / 's', [END], [(0, 1, 1, 1, 'p', 3)], head='compact')
+    text = (folder / 'metadata').read_text()
+    (folder / 'metadata').write_text(text.replace('extended = 31', 'extended = 3'))
+    with pytest.raises(TraceError, match='/s: its metadata cannot be read .* not those of LTTng'):
+        import_ctf(folder, tmp_path / 'out.mcap')
+
+
 _LINE = re.compile(r'\[(\d+)\.(\d{9})\] \(\S+\) (?:\S+ )?([^ ]+): \{.*?vpid = (\d+), '
                    r'vtid = (\d+), procname = "(.*?)" \}, \{(.*)\}')
 
