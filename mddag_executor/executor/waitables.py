@@ -14,7 +14,9 @@ Theory of operation
 3.  Setting the listener of a QoS event marks earlier events as known, so a wait set does not
     report them any more.  Therefore all events are taken, and those with unchanged counts are
     dropped.  It also forgets by how much the counts have changed since they were taken.  So an
-    event keeps its listener when the shared source is made again.
+    event keeps its listener when the shared source is made again.  Meanwhile both sources contain
+    it.  It notes in itself its place in the wait set that was filled last, so only one source may
+    fill its set and ask it at a time (``_filling``).
 4.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next.
 5.  *The exception* is a thread that waits in a wait set (``WaitSetThread``).  It waits for rclpy's
     signal condition, because rclpy's handler of SIGTERM is written in C++: it triggers the
@@ -357,6 +359,9 @@ _known: weakref.WeakKeyDictionary[Entity, list[int]] = weakref.WeakKeyDictionary
 """The counts of each QoS event at the last take."""
 
 
+_filling = threading.Lock()
+
+
 class EventsSource(WaitableSource):
     """
     QoS events (rclpy's ``EventHandler``) that share a descriptor.
@@ -367,7 +372,8 @@ class EventsSource(WaitableSource):
     def __init__(
         self, note: Callable[[Any, Any], None], entities: Iterable[Entity], pool: Hall
     ) -> None:
-        super().__init__(entities, pool)
+        with _filling:
+            super().__init__(entities, pool)
         self._note = note
 
     def _collect(self) -> None:
@@ -385,7 +391,8 @@ class EventsSource(WaitableSource):
                 self._note(event, status)
                 found.append(Work(entity, event.execute, (status,)))
 
-        self._set.wait(None, take)
+        with _filling:
+            self._set.wait(None, take)
         if found:
             self._pool.post(found)
 

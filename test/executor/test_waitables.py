@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Actions, QoS events, guard conditions, waitables of a user's own, and timers with info."""
 
+from concurrent.futures import ThreadPoolExecutor
 import os
+import sys
 import threading
 import time
 
@@ -339,3 +341,33 @@ def test_a_timer_gives_its_info_to_who_asks_for_it(make_executor, make_node):
     for expected, actual in seen:
         assert expected <= actual and expected.clock_type == node.get_clock().clock_type
         assert (expected - seen[0][0]).nanoseconds % 20_000_000 == 0
+
+
+def test_no_event_is_taken_for_another_while_events_come_and_go(make_executor, make_node):
+    """An event notes in itself its place in a wait set: two sources must not mix them up."""
+    stays, changes, matched, wrong = make_node('stays'), make_node('changes'), [], []
+    callbacks = PublisherEventCallbacks(
+        matched=matched.append, incompatible_qos=wrong.append, liveliness=wrong.append,
+        deadline=wrong.append)
+    for number in range(12):
+        stays.create_publisher(Header, f'/seen{number}', 1, event_callbacks=callbacks)
+    interval, ends = sys.getswitchinterval(), time.monotonic() + 2.5
+
+    def churn(number):
+        while time.monotonic() < ends:
+            publisher = changes.create_publisher(
+                Header, f'/other{number}', 1,
+                event_callbacks=PublisherEventCallbacks(matched=lambda event: None))
+            subscription = changes.create_subscription(
+                Header, f'/seen{number}', lambda message: None, 1)
+            time.sleep(0.002)
+            changes.destroy_publisher(publisher)
+            changes.destroy_subscription(subscription)
+
+    sys.setswitchinterval(1e-5)
+    try:
+        with Spinning(make_executor(nodes=[stays, changes])), ThreadPoolExecutor() as pool:
+            list(pool.map(churn, range(3)))
+    finally:
+        sys.setswitchinterval(interval)
+    assert len(matched) > 10 and wrong == []
