@@ -22,7 +22,6 @@ import json
 import os
 from pathlib import Path, PurePosixPath
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -35,10 +34,9 @@ from typing import NamedTuple
 import hypothesis
 import pytest
 
-HERE = Path(__file__).resolve().parent
+from .ros_domains import claim_domain
 
-# Domains above 101 collide with the ephemeral ports of Linux; low ones are what people use.
-DOMAINS = range(40, 102)
+HERE = Path(__file__).resolve().parent
 
 CI = bool(os.environ.get('CI'))
 NEEDS = 'needs '
@@ -113,18 +111,11 @@ def pytest_unconfigure(config):
 
 def _claim_domain():
     """Return a domain that no other session has for as long as this one lasts."""
-    start = os.getpid() % len(DOMAINS)
-    for domain in (*DOMAINS[start:], *DOMAINS[:start]):
-        # A name without a file: it is gone with the process, and reaches as far as DDS does.
-        claim = socket.socket(socket.AF_UNIX)
-        try:
-            claim.bind(f'\0mddag-test-domain-{domain}')
-        except OSError:
-            claim.close()
-        else:
-            _session.enter_context(claim)
-            return domain
-    raise pytest.UsageError('every ROS domain for tests is in use by another test session')
+    domain, claim = claim_domain()
+    if domain is None:
+        raise pytest.UsageError('every ROS domain for tests is in use by another test session')
+    _session.enter_context(claim)
+    return domain
 
 
 @cache

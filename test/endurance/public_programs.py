@@ -38,7 +38,6 @@ from pathlib import Path
 import random
 import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -53,14 +52,15 @@ from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
+sys.path.append(str(Path(__file__).parents[1]))
+from ros_domains import claim_domain
+
 TOLERANCE, FEW = 0.25, 3
 """Counts that differ by this part, or by so many messages, are the same."""
 START_S, END_S = 15.0, 45.0
 """How long a program may take to publish first, and to end after SIGINT."""
 LATEST_S = 2.0
 """The latest moment of an interrupt, after the first line of the program."""
-DOMAINS = range(40, 102)
-"""The ROS domains of the tests, which claim them in the same way."""
 
 _OK, _FAILED, _INTERRUPTED = 0, 1, 128 + signal.SIGINT
 _CRASHES = (128 + signal.SIGABRT, 128 + signal.SIGSEGV)
@@ -280,20 +280,6 @@ class Place:
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
-def claim_domain():
-    """Set a ROS domain that no test has; return what claims it."""
-    for domain in random.sample(DOMAINS, len(DOMAINS)):
-        claim = socket.socket(socket.AF_UNIX)
-        try:
-            claim.bind(f'\0mddag-test-domain-{domain}')
-        except OSError:
-            claim.close()
-        else:
-            os.environ['ROS_DOMAIN_ID'] = str(domain)
-            return claim
-    sys.exit('error: every ROS domain for tests is in use: try again later')
-
-
 def _status(process):
     """Return its exit status; that of a shell for a signal."""
     return process.returncode if process.returncode >= 0 else 128 - process.returncode
@@ -441,7 +427,11 @@ def main():
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     before = [os.environ['PYTHONPATH']] if os.environ.get('PYTHONPATH') else []
     differ = []
-    with claim_domain():
+    domain, claim = claim_domain()
+    if claim is None:
+        sys.exit('error: every ROS domain for tests is in use: try again later')
+    os.environ['ROS_DOMAIN_ID'] = str(domain)
+    with claim:
         for program in PROGRAMS:
             if options.only in (None, program.name):
                 path = [str((options.sources / each).resolve()) for each in program.folders]

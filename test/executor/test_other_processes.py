@@ -192,6 +192,15 @@ SOMETIMES = graph(
         name: map, subscription: /boxes, deadline: 60s""")
 
 
+def check_not_due(executor, nodes, n):
+    """Check that all of n jobs completed, and that the brake was due in those in which it ran."""
+    dag = executor.statistics()['dags']['main']
+    stop, n_ran = dag['sinks']['/brake:stop'], len(nodes.ran['stop'])
+    assert (stop['completed'], stop['not_due']) == (n_ran, n - n_ran)
+    assert dag['sinks']['/brake:map']['completed'] == n
+    assert dag['ends']['completed'] == n
+
+
 def test_a_result_that_another_process_did_not_ask_for_is_not_due(make_executor, make_node):
     """The detector is elsewhere: its jobs end where the brake is, and do not wait to expire."""
     nodes = Declared(make_node, SOMETIMES, {'detect': lambda: frozenset(
@@ -207,11 +216,7 @@ def test_a_result_that_another_process_did_not_ask_for_is_not_due(make_executor,
         n = len(nodes.ran['detect'])
         assert wait_for(lambda: sum(
             executors[1].statistics()['dags']['main']['ends'].values()) == n)
-    sinks = executors[1].statistics()['dags']['main']['sinks']
-    assert (sinks['/brake:stop']['completed'], sinks['/brake:stop']['not_due']) == (
-        len(nodes.ran['stop']), n - len(nodes.ran['stop']))
-    assert sinks['/brake:map']['completed'] == n
-    assert executors[1].statistics()['dags']['main']['ends']['completed'] == n
+    check_not_due(executors[1], nodes, n)
 
 
 STAMPED = SOMETIMES.replace('dag: main', 'dag: main, release_from: header_stamp')
@@ -249,11 +254,7 @@ def test_a_result_that_another_machine_did_not_ask_for_is_not_due(
         assert wait_for(lambda: sum(
             executors[1].statistics()['dags']['main']['ends'].values()) == n)
     assert executors[1].statistics()['dags']['main']['jobs'] == n
-    sinks = executors[1].statistics()['dags']['main']['sinks']
-    assert (sinks['/brake:stop']['completed'], sinks['/brake:stop']['not_due']) == (
-        len(nodes.ran['stop']), n - len(nodes.ran['stop']))
-    assert sinks['/brake:map']['completed'] == n
-    assert executors[1].statistics()['dags']['main']['ends']['completed'] == n
+    check_not_due(executors[1], nodes, n)
 
 
 def test_a_result_is_due_if_another_machine_says_nothing(make_executor, make_node):
