@@ -239,12 +239,15 @@ class Chains:
         before = np.array([each + [-1] * (width - len(each)) for each in legs])
         row = self._of_dag(dag)[0][:, missed['row']].T
         row[self._executions['began'][row] > missed['until'][:, None]] = -1
+        # a sync that has not got all of its messages has run, but is where the job ended
+        unfinished = (row < 0) | (self._is_other[row] & ~self._is_driven[dag]
+                                  & (self._executions['completes'][row] == LEG))
         end = np.where(self._is_other[row], NEVER, self._executions['end'][row])
         every, at = np.arange(len(missed)), missed['sink'] - self._first[dag]
         back = np.flatnonzero(missed['kind'] != SINK_LATE)
         while len(back):
             publishers = before[at[back]]
-            missing = (publishers >= 0) & (row[back[:, None], publishers] < 0)
+            missing = (publishers >= 0) & unfinished[back[:, None], publishers]
             some = missing.any(axis=1)
             back, first = back[some], missing[some].argmax(axis=1)
             at[back] = publishers[some, first]

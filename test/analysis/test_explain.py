@@ -207,9 +207,15 @@ def test_an_undeclared_callback_may_hold_the_interpreter(aborted, tmp_path, call
             'replay', path, '--reschedule').stdout
 
 
-def test_a_sync_that_lacks_a_message_did_not_run_long(tmp_path, call):
+FOLLOWED = SYNC.replace('deadline: 22ms', 'publishes: [/out]') + """\
+  - {node: /after, callbacks: [{name: act, subscription: /out, deadline: 22ms}]}
+"""
+
+
+@pytest.mark.parametrize('graph', [SYNC, FOLLOWED], ids=['sink', 'followed'])
+def test_a_sync_that_lacks_a_message_did_not_run_long(graph, tmp_path, call):
     # /image has another name in the node
-    trace = Written(tmp_path / 'run.mcap', SYNC)
+    trace = Written(tmp_path / 'run.mcap', graph)
     for job in range(20):
         at = job * 50
         trace.release(0, job, at)
