@@ -247,7 +247,7 @@ def _row(load: str, result: dict[str, Any]) -> list[tuple[str, Cell]]:
     else:
         row += [('published', result['published']), ('lost', result['lost'])]
     row += [('callbacks/s', _number(result['callbacks_per_s'], '.0f')),
-            ('CPU each', _number(result['cpu_us_per_callback'], '.1f', ' us'))]
+            ('CPU per callback', _number(result['cpu_us_per_callback'], '.1f', ' us'))]
     if load not in DECLARED:
         row.append(('of it DDS', _number(
             result['middleware_cpu_us_per_callback'], '.1f', ' us')))

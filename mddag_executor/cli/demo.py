@@ -118,5 +118,5 @@ def _side_by_side(ours: dict[str, Any], peer: dict[str, Any]) -> str:
         row('in time', lambda r: percent(r['on_time'], r['sink_jobs_due'])),
         row('late', lambda r: str(r['late'])), row('missing', lambda r: str(r['missing'])),
         row('callbacks a second', lambda r: f'{r["callbacks_per_s"]:.0f}'),
-        row('CPU each', lambda r: '-' if r['cpu_us_per_callback'] is None
+        row('CPU per callback', lambda r: '-' if r['cpu_us_per_callback'] is None
             else f'{r["cpu_us_per_callback"]:.0f} us')))

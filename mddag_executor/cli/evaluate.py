@@ -53,7 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='number of the first run: results of ranges that do not overlap can be merged by '
         'adding their counts (default: 0)')
     add('--policies', default=','.join(defaults.POLICIES), metavar='P,P…',
-        help=f'any of {", ".join((*POLICIES, *SIMULATED_ONLY))} (default: %(default)s)')
+        help=f'any of {", ".join((*POLICIES, *SIMULATED_ONLY))}, or MODULE:FUNCTION, which is one '
+        'of your own (default: %(default)s)')
     add('--execution-times', metavar='FILE.npz', type=options.Input,
         help="measured execution times, an array of ns for each 'node:callback' (default: the "
         'quantile tables of the declaration)')

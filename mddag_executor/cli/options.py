@@ -234,7 +234,8 @@ def _policy() -> dict[str, Any]:
     from mddag_executor.core.policies import POLICIES, SIMULATED_ONLY
     return {
         'type': _simulated_policy, 'default': 'rad', 'metavar': 'P',
-        'help': f'one of {", ".join((*POLICIES, *SIMULATED_ONLY))}', 'otherwise': 'rad'}
+        'help': f'one of {", ".join((*POLICIES, *SIMULATED_ONLY))}, or MODULE:FUNCTION, which is '
+        'one of your own', 'otherwise': 'rad'}
 
 
 def _simulated_policy(text: str) -> str:
@@ -253,8 +254,8 @@ def _on_late() -> dict[str, Any]:
     from mddag_executor.core.tables import ON_LATE
     return {
         'choices': (*ON_LATE,), 'default': 'continue', 'otherwise': '%(default)s',
-        'help': 'what to do with a job that can no longer be in time, unless the declaration says '
-        'it'}
+        'help': 'how to treat a job that can no longer be in time, if the declaration does not '
+        'say it'}
 
 
 def add(

@@ -151,6 +151,7 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
         return _rescheduled_bag(args, source, settings)
     options.reject_options(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
+    from mddag_executor.simulate.policies import ALL_POLICIES
     from mddag_executor.sources.open import open_recording
     from mddag_executor.whatif.agreement import disagreement
     from mddag_executor.whatif.reschedule import reschedule
@@ -162,7 +163,13 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
             processes=processes, **settings)
         is_changed = any(
             each is not None for each in (args.overheads, processes, *changes.values()))
-        text = disagreement(reschedule(recording, skip=skip) if is_changed else outcome)
+        text = None
+        recorded_policy = recording.run.head.policy
+        if not is_changed:
+            text = disagreement(outcome)
+        elif recorded_policy == args.policy or recorded_policy in ALL_POLICIES:
+            same = args.policy if recorded_policy == args.policy else None
+            text = disagreement(reschedule(recording, policy=same, skip=skip))
     if text is not None:
         outcome.warnings.append(text)
     return outcome

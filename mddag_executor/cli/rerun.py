@@ -36,8 +36,8 @@ REMOVED_OPTIONS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('recording', metavar='BAG|TRACE', type=options.Input,
-        help="a bag with the messages that the nodes take, or a trace of mddag run ('-': standard "
-        'input)')
+        help="a bag with the messages that the nodes receive, or a trace of mddag run ('-': "
+        'standard input)')
     options.add(parser, 'graph', '--workers', '--json', '--overwrite', '--ros-args')
     add('--node', metavar='SPEC', action='append', required=True,
         help='run this node, as mddag run does; repeat the option for more nodes')

@@ -3,10 +3,10 @@
 """
 The verb `slack`: how much longer callbacks may take before a deadline is missed.
 
-If deadlines are missed already, it says how much less they must take.
+If deadlines are missed already, it says how much shorter callbacks must become.
 
-A recorded run is rescheduled (see `replay --reschedule`), a declaration is simulated (see
-`simulate`), as often as it takes; `mddag_executor.whatif.slack` says how.
+A recorded run is rescheduled (see `replay --reschedule`), and a declaration is simulated (see
+`simulate`), many times with other execution times; `mddag_executor.whatif.slack` says how.
 """
 
 from __future__ import annotations

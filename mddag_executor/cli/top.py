@@ -4,8 +4,8 @@
 The verb `top`: the states of sinks and workers on `/diagnostics`, live in a terminal.
 
 It only listens, so it watches processes on any machine that ROS reaches, and costs them nothing.
-Statuses of others on the topic are left out. On a terminal the tables are renewed in place;
-elsewhere, or with `--once`, they are printed as a whole.
+Statuses of other programs on the topic are left out. On a terminal the tables are renewed in
+place; elsewhere, or with `--once`, they are printed as a whole.
 """
 
 from __future__ import annotations

@@ -37,6 +37,7 @@ from mddag_executor.errors import MddagError, UsageError
 from mddag_executor.laboratory.acceptance import Evaluation
 from mddag_executor.laboratory.draws import Draws
 from mddag_executor.laboratory.experiment import Chunk, Evaluator, Experiment, STRIDE
+from mddag_executor.simulate.policies import is_of_user
 from mddag_executor.simulate.schedule import compiling_pays, PLAIN_S, SOON_S
 
 Submit = Callable[[int, int], 'Future[Chunk]']
@@ -74,9 +75,13 @@ def evaluate(
     """
     experiments = (experiment,) if isinstance(experiment, Experiment) else tuple(experiment)
     _check(experiments, runs, first_run)
+    of_user = [name for each in experiments for name in each.policies if is_of_user(name)]
     if compiled is None:
-        compiled = compiling_pays(plain_s(experiments, runs) / jobs)
+        compiled = not of_user and compiling_pays(plain_s(experiments, runs) / jobs)
     if compiled:
+        if of_user:
+            raise UsageError(f"policy '{of_user[0]}': policies of your own are not compiled: "
+                             'leave out compiled=True')
         from mddag_executor.simulate.compiled import check_available, prepare
         check_available()
     if not compiled and dask is None and plain_s(experiments, runs) < SOON_S:

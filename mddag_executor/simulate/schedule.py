@@ -22,8 +22,8 @@ from mddag_executor.core.state import (
 from mddag_executor.simulate.deliveries import Deliveries
 from mddag_executor.simulate.engine import EngineOptions, run
 from mddag_executor.simulate.machine import Machine
+from mddag_executor.simulate.policies import is_of_user, preempts, ROS2
 from mddag_executor.simulate.policies import policy as find_policy
-from mddag_executor.simulate.policies import preempts, ROS2
 from mddag_executor.simulate.pool import LogEntry, Pool
 from mddag_executor.simulate.workload import as_list, as_lists, Workload
 
@@ -162,6 +162,8 @@ def schedule(
 
 def prepare(tables: Tables, load: Workload, settings: Settings, runs: int = 1) -> bool:
     """Return whether ``runs`` runs are faster compiled; if so, compile, or load the code."""
+    if is_of_user(settings.policy):
+        return False
     executions = runs * len(load.times) * max(1, tables.n_vertices // max(1, tables.n_dags))
     stops = len(load.holds) > 0 or settings.cpus is not None
     if not compiling_pays(executions * (_STOPS_S if stops else PLAIN_S)):

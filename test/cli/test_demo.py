@@ -33,7 +33,7 @@ def test_the_main_job_end_to_end(tmp_path, mddag):
     assert verdicts == measured['sink_jobs_due'] > 200
     assert (tmp_path / 'demo.mcap').read_bytes()[:5] == b'\x89MCAP'
     for text in ('$ mddag run ', '$ mddag replay ', 'MultiThreadedExecutor', 'measured for',
-                 'CPU each'):
+                 'CPU per callback'):
         assert text in process.stdout
 
 

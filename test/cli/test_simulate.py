@@ -6,6 +6,7 @@ import errno
 import os
 from pathlib import Path
 import resource
+import sys
 
 from mddag_executor import open_recording
 import pytest
@@ -94,3 +95,76 @@ nodes:
     mine = run.executions[(run.executions['dag'] == 1) & (run.executions['worker'] >= 0)]
     starts = [run.start, *mine['start'].tolist(), run.end]
     assert max(after - before for before, after in zip(starts, starts[1:])) <= 11.1e9
+
+
+POLICIES = """\
+from mddag_executor.core.policies import Policy
+from mddag_executor.core.state import DEADLINE_KEYS
+
+
+def late_first(tables, vertex, release, job, order):
+    return -tables.rad_offset[vertex], order, 0, 0
+
+
+def rad(tables, vertex, release, job, order):
+    return (release + tables.rad_offset[vertex], tables.index_in_dag[vertex],
+            tables.dag_of[vertex], order)
+
+
+def three(tables, vertex, release, job, order):
+    return 1.5, 0, 0
+
+
+def broken(tables, vertex, release, job, order):
+    return tables.no_such_column[vertex]
+
+
+like_rad = Policy('any name', rad, True, 'as rad', urgency=DEADLINE_KEYS)
+number = 1
+"""
+
+
+@pytest.fixture
+def policies(folder, monkeypatch):
+    """Give the name of a module of policies in the folder."""
+    monkeypatch.setattr('sys.path', [*sys.path])
+    name = f'policies_{folder.name}'
+    (folder / f'{name}.py').write_text(POLICIES)
+    yield name
+    sys.modules.pop(name, None)
+
+
+def test_a_policy_of_a_user_s_own(call, graph, policies):
+    simulate = ('simulate', graph, '--workers', 1, '--duration', '40ms', '--on-late', 'demote',
+                '--json', '-')
+    ours, theirs = (call(*simulate, '--policy', name).result
+                    for name in ('rad', f'{policies}:like_rad'))
+    assert theirs['policy'] == f'{policies}:like_rad' and theirs['dags'] == ours['dags']
+    late = call(*simulate, '--policy', f'{policies}:late_first', '--trace', 'run.mcap').result
+    assert sinks(late)['/filter:near'][1] > sinks(ours)['/filter:near'][1]
+    names = ['rad', f'{policies}:like_rad', f'{policies}:late_first']
+    accepted = call('evaluate', graph, '--runs', 4, '--parallel', 1, '--json', '-',
+                    '--policies', ','.join(names)).result['policies']
+    assert [*accepted] == names and accepted[names[0]] == accepted[names[1]]
+    # the recording only names it: it runs when it is asked for
+    replayed = call('replay', 'run.mcap', '--json', '-')
+    assert replayed.result['policy'] == f'{policies}:late_first'
+    refused = call('replay', 'run.mcap', '--reschedule')
+    assert refused.returncode == 2 and 'give --policy' in refused.stderr
+    again = call('replay', 'run.mcap', '--reschedule', '--json', '-', '--policy',
+                 f'{policies}:late_first').result
+    assert sinks(again) == sinks(late)
+    assert call('replay', 'run.mcap', '--reschedule', '--policy', 'rad').returncode == 0
+    assert call('slack', graph, '--duration', '40ms', '--policy', f'{policies}:like_rad',
+                '--parallel', 1).returncode == 0
+
+
+@pytest.mark.parametrize(('name', 'status', 'says'), [
+    ('three', 2, 'it returned (1.5, 0, 0): let it return four integers'),
+    ('number', 2, 'it cannot be called: give a function'),
+    ('missing', 2, 'it cannot be imported (AttributeError: module '),
+    ('broken', 70, "'Tables' object has no attribute 'no_such_column'")])
+def test_a_policy_that_cannot_be_used(call, graph, policies, name, status, says):
+    done = call('simulate', graph, '--policy', f'{policies}:{name}')
+    assert done.returncode == status and says in done.stderr
+    assert ('Traceback' in done.stderr) == (status == 70)
