@@ -229,7 +229,7 @@ class Paths:
 
     def _sent_at(self, callback: Callback, topic: int, ended: Ends) -> Ints:
         """Return when executions of a computed run published a topic: at their ends or before."""
-        found, by, started = ended.time.copy(), self._vertex[ended.rows], self._table['start'] >= 0
+        found, by = ended.time.copy(), self._vertex[ended.rows]
         for number, before in enumerate(self._task_set.vertices):
             if before.callback is not callback:
                 continue
@@ -239,7 +239,8 @@ class Paths:
                 topics = self._task_set.vertices[after].callback.topics
                 if topic not in map(self._topics.get, topics):
                     continue
-                begun = np.flatnonzero((self._vertex == after) & started)
+                begun = self._of_place[self._place[after]]
+                begun = begun[(self._vertex[begun] == after) & (self._table['start'][begun] >= 0)]
                 at = equal(self._table['job'][begun], ended.job[mine])
                 known = at >= 0
                 published = mine[known]
@@ -320,7 +321,7 @@ class Paths:
         # by execution its step at the position
         step_of: Any = np.full(len(self._table), NONE, dtype=np.int32)
         before: tuple[_Timeline, _Timeline] | None = None
-        messages = np.empty((0, 3), dtype=np.int64)
+        messages = _Messages(*[np.empty(0, dtype=np.int64)] * 3)
         for position, key in enumerate(path.callbacks):
             callback = self._task_set.callback(key)
             hop = path_hops[position - 1] if position else None
@@ -334,7 +335,7 @@ class Paths:
             if hop is not None and before is not None:
                 if hop.kind == 'trigger':
                     for message in self._messages_for(path.callbacks[position - 1], ran):
-                        found = _as_of_each(messages, message, ran.start)
+                        found = messages.as_of(message, ran.start)
                         parent = np.where(found != NONE, found, parent)
                 else:
                     timeline = before[hop.kind == 'topic']
@@ -343,8 +344,7 @@ class Paths:
                 taker, taken = self._took
                 at = equal(ran.runs, taker)
                 mine = at != NONE
-                parent[at[mine]] = _as_of_each(
-                    messages, taken[mine], np.full(int(mine.sum()), _NEVER))
+                parent[at[mine]] = messages.as_of(taken[mine], np.full(int(mine.sum()), _NEVER))
             step = step_of[ran.runs] = steps.add(position, parent, ran.start, ran.runs)
             topics = [self._topics[t] for t in path_hops[position].topics] \
                 if position < len(path_hops) else []
@@ -392,7 +392,7 @@ class Paths:
     def _publish(
         self, steps: _Steps, position: int, callback: Callback, ran: _Timeline, step_of: Ints,
         sent: Table,
-    ) -> tuple[_Timeline, Ints]:
+    ) -> tuple[_Timeline, _Messages]:
         """
         Make the steps of the publications at a position; return times and messages.
 
@@ -404,7 +404,7 @@ class Paths:
         parent[latest] = ran.as_of(time[latest], before=True)
         made = steps.add(position, parent, time)
         there = (made != NONE) & (message != NONE)
-        return _Timeline(time, made), np.column_stack((message, time, made))[there]
+        return _Timeline(time, made), _Messages(message[there], time[there], made[there])
 
     def results(self) -> dict[str, PathResult]:
         """
@@ -440,6 +440,33 @@ class _Timeline(NamedTuple):
             return np.full(len(times), NONE)
         at = (last_before if before else as_of)(self.times, times)
         found: Ints = np.where(at >= 0, self.steps[at], NONE)
+        return found
+
+
+class _Messages(NamedTuple):
+    """The messages that were published at a position: numbers, times, and steps."""
+
+    numbers: Ints
+    times: Ints
+    steps: Ints
+
+    def as_of(self, wanted: Ints, times: Ints) -> Ints:
+        """Return the last step of each wanted message up to a time; -1: none."""
+        if not len(self.numbers):
+            return np.full(len(wanted), NONE)
+        if (self.numbers[1:] > self.numbers[:-1]).all():    # each message was published once
+            at = np.minimum(np.searchsorted(self.numbers, wanted), len(self.numbers) - 1)
+            there = (self.numbers[at] == wanted) & (self.times[at] <= times)
+            return np.where(there, self.steps[at], NONE)
+        n = len(self.numbers)
+        number = np.r_[self.numbers, wanted]
+        is_asked = np.r_[np.zeros(n, dtype=np.int64), np.ones(len(wanted), dtype=np.int64)]
+        order = sort_by(number, np.r_[self.times, times], is_asked)
+        is_message: Mask = order < n
+        last = last_of(is_message, number[order])
+        good = ~is_message & (last >= 0)
+        found = np.full(len(wanted), NONE)
+        found[order[good] - n] = self.steps[order[last[good]]]
         return found
 
 
@@ -562,22 +589,4 @@ def cases(start: Ints, end: Ints) -> dict[str, Ints]:
     found['best'] = took[::-1][np.unique(own[::-1], return_index=True)[1]]
     after = np.unique(own[1:], return_index=True)[1]
     found['worst_with_external_latency'] = own[1:][after] - inputs[after]
-    return found
-
-
-def _as_of_each(messages: Ints, wanted: Any, times: Ints) -> Ints:
-    """
-    Return the last step of each message up to a time; -1: none.
-
-    :param messages: rows of message, time and step.
-    """
-    n = len(messages)
-    number = np.r_[messages[:, 0], wanted]
-    is_asked = np.r_[np.zeros(n, dtype=np.int64), np.ones(len(wanted), dtype=np.int64)]
-    order = sort_by(number, np.r_[messages[:, 1], times], is_asked)
-    is_message: Mask = order < n
-    last = last_of(is_message, number[order])
-    good = ~is_message & (last >= 0)
-    found = np.full(len(wanted), NONE)
-    found[order[good] - n] = messages[order[last[good]], 2]
     return found

@@ -103,6 +103,9 @@ def rows_by(numbers: Any, n: int) -> list[Ints]:
 
 def equal(numbers: Ints, wanted: Any) -> Ints:
     """Return the first positions of wanted numbers; ``UNKNOWN`` for missing ones."""
+    if len(numbers) and (numbers[1:] >= numbers[:-1]).all():
+        at = np.minimum(np.searchsorted(numbers, wanted), len(numbers) - 1)
+        return np.where(numbers[at] == wanted, at, UNKNOWN)
     order = np.append(sort_by(numbers), UNKNOWN)
     at = order[np.searchsorted(numbers, wanted, sorter=order[:-1])]
     found: Ints = np.where(np.append(numbers, 0)[at] == wanted, at, UNKNOWN)
