@@ -138,7 +138,7 @@ def _count_for(seconds: float) -> int:
 
 
 def record(cause: str, trace: Path, misses: int, scale: float = 1.0) -> None:
-    """Record a run with about so many misses."""
+    """Record a run with about this many misses."""
     seconds = misses * PERIODS[cause] * PERIOD_MS / 1e3 * scale + 1
     process = subprocess.Popen(
         [sys.executable, __file__, '--record', cause, str(trace), str(seconds),
@@ -181,7 +181,7 @@ def main() -> None:
     """Measure, or record one run."""
     parser = argparse.ArgumentParser(description='What explain reports of live runs.')
     parser.add_argument('cause', nargs='*', choices=[*PERIODS, []], help='default: all of them')
-    parser.add_argument('--misses', type=int, default=100, help='about so many of each cause')
+    parser.add_argument('--misses', type=int, default=100, help='about this many of each cause')
     parser.add_argument('--scale', type=float, default=1.0, help='of all times')
     parser.add_argument('--record', nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()

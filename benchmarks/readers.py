@@ -48,7 +48,7 @@ def peak_memory_mb() -> float:
 
 
 def write_long_trace(path: str, task_set: TaskSet, events: int) -> None:
-    """Write the trace of a run of at least so many events: one a release, four an execution."""
+    """Write the trace of a run of at least this many events: one a release, four an execution."""
     settings = Settings(duration_ns=math.ceil(events / sum(
         (1 + 4 * len(dag.vertices)) / dag.period_ns for dag in task_set.dags)),
         judge='completions')

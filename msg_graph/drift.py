@@ -17,7 +17,7 @@ The rules are the same for live runs and recordings. Observations are counts by 
    time up to then, so no verdict shows this.
 3. *rate* of a subscription: it received messages more or less often than the callbacks that
    publish them ran here, by more than ``TOLERANCE``. At least ``LEAST`` expected messages are
-   needed. Dropped messages count as received: their loss is no fault of the declaration. Syncs
+   needed. Dropped messages count as received: their loss says nothing about the declaration. Syncs
    are not checked, because a declaration does not say how messages are joined. A topic that a
    callback may publish (``may_publish``) has only an upper bound, and its subscribers may never
    run.

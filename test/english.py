@@ -65,7 +65,7 @@ PATTERNS = (
             r"\bon time\b|\bsink jobs\b|\bsinks' jobs\b",
             'All sinks are on time.'),
     Pattern("write 'after that', 'later', 'the rest'",
-            r'\bfrom then on\b|\bfrom there on\b|\bthereof\b|\bhence?forth\b',
+            r'(?i:\bfrom then on\b|\bfrom there on\b)|\bthereof\b|\bhence?forth\b',
             'Lost from then on.'),
     Pattern("write 'still running' or 'remains'",
             r'\bleft behind\b', 'Two threads are left behind.'),
@@ -82,6 +82,19 @@ PATTERNS = (
     Pattern("write 'later', 'longer' or 'how much longer'",
             r'\b[Hh]ow many times as\b|\bas late as\b|\bas \w+ as where\b',
             'How many times as long callbacks may take.'),
+    Pattern("write 'is not a …'",
+            r'(?<!there )(?<!There )\b(?:is|are|was|were) no (?!longer\b|more\b|such\b)[a-z]',
+            'A shorter time is no stop.'),
+    Pattern("write 'no longer'",
+            r'\bno more(?=[.,;:)]|$)|\bno \w+ any more\b',
+            'A callback that is overtaken no more.'),
+    Pattern("write 'this many'", r'\b[Ss]o many\b(?! that\b)', 'It waits for so many periods.'),
+    Pattern("write 'report', 'say', 'notify' or 'distinguish'",
+            r'\b(?:tells?|told)\b', 'The pool is told of changes.'),
+    Pattern("begin with the subject: not 'Of a callback …'",
+            r'(?:^|[.;] |\* |\d\. )Of (?:a|an|the|each|its|several|all) ',
+            'Of a DAG they end together.'),
+    Pattern("write 'for ever'", r'\bfor good\b', 'It starves for good.'),
 )
 
 

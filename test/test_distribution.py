@@ -140,7 +140,7 @@ def built(tmp_path_factory):
         ['git', 'ls-files', '--cached', '--others', '--exclude-standard'], cwd=TOP,
         capture_output=True, text=True, check=False)
     if files.returncode != 0:
-        pytest.skip('this is no git checkout')
+        pytest.skip('this is not a git checkout')
     for name in filter(lambda name: (TOP / name).is_file(), files.stdout.splitlines()):
         (place / 'checkout' / name).parent.mkdir(parents=True, exist_ok=True)
         (place / 'checkout' / name).write_bytes((TOP / name).read_bytes())

@@ -87,7 +87,7 @@ def violations():
             mine, theirs, foreign = part_of(module), part_of(name), name.split('.')[0]
             passed_on = f'{module}.{name.split(".")[-1]}' in PASSED_ON
             if theirs not in (None, mine) and LEVELS[theirs] >= LEVELS[mine] and not passed_on:
-                yield f'{module}:{line} imports {name}: {theirs} is no part below {mine}'
+                yield f'{module}:{line} imports {name}: {theirs} is not below {mine}'
             if mine == 'mddag_executor.core' and foreign in NOT_IN_CORE:
                 yield f'{module}:{line} imports {name}: the core knows no clock and no thread'
             if mine in NO_EVENTS and theirs == 'mddag_executor.trace':

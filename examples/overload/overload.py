@@ -48,7 +48,7 @@ def stage(name: str, takes_s: float, topic: str, to: str | None, depth: int) -> 
 
 
 def run(depth: int) -> None:
-    """Run for two seconds, with so many images waiting at most."""
+    """Run for two seconds, with at most ``depth`` images waiting."""
     reported: Counter[str] = Counter()
 
     def missed(miss: DeadlineMiss) -> None:

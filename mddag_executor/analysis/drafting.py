@@ -50,15 +50,15 @@ LEAST_SILENT, LEAST_SILENT_SHARE = 2, 0.02
 DRIVEN_SHARE = 0.15
 """The largest difference of two numbers of executions that count as equal."""
 COPIED_SHARE = 0.9
-"""A callback copies header stamps if so many of its messages have one of a received topic."""
+"""A callback copies header stamps if this share of its messages has one of a received topic."""
 STORES_NS = 500_000
 """A callback that only stores its message takes no longer in nine of ten executions."""
 IRREGULAR = 3
-"""Times between executions are irregular if one in ten is so many times another one in ten."""
+"""Times between executions are irregular if the 90 % quantile is this many times the 10 % one."""
 ONCE_PERIODS = 3
-"""A timer fires once if it was silent for so many periods after its only execution."""
+"""A timer fires once if it was silent for this many periods after its only execution."""
 NEVER_PERIODS = 20
-"""A timer never fires if a recording of so many periods has no execution of it."""
+"""A timer never fires if a recording of this many periods has no execution of it."""
 LEAST_COPIED = 5
 """From fewer messages with header stamps nothing is concluded."""
 _NO_STAMPS: Ints = np.empty(0, dtype=np.int64)

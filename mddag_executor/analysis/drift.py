@@ -45,7 +45,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             of.add(int(mine.min()))
             of.add(int(mine.max()))
             of.count = len(mine)
-            if not recording.run.declared and key in periods:  # skipped releases are no jobs
+            if not recording.run.declared and key in periods:  # skipped releases have no jobs
                 skipped = np.rint(np.diff(np.sort(mine)) / periods[key]) - 1
                 of.count += int(skipped[skipped > 0].sum())
     # declared callbacks that were started, and other executions, a coroutine's once each

@@ -49,7 +49,7 @@ _KINDS: dict[str, dict[str, Any]] = {
     'input': {'type': options.Input},
     'trace': {'type': options.TraceOfRun},
 }
-"""What the parser is told about an option of a kind."""
+"""The parser's arguments for an option of a kind."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

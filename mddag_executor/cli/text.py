@@ -63,8 +63,8 @@ class Progress:
     One line on a terminal for work that takes longer than two seconds, and silence otherwise.
 
     It is a context manager; the line is wiped when the work ends. Nothing is written when the
-    stream (standard error by default) is no terminal. It shows ``what`` is going on, for instance
-    `simulating`, and how much of the ``total`` is done, if that is known.
+    stream (standard error by default) is not a terminal. It shows ``what`` is going on, for
+    instance `simulating`, and how much of the ``total`` is done, if that is known.
     """
 
     PATIENCE_S = 2.0

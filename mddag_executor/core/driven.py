@@ -35,7 +35,7 @@ from msg_graph import Callback
 ANSWERED, GUESSED = 0, 1
 """The leg, in recordings, of an execution that answers a job; whether it is a guess."""
 MOST_AWAITING = 1000
-"""So many jobs may await an answer; of more, the oldest are forgotten."""
+"""This many jobs may await an answer; if there are more, the oldest are forgotten."""
 
 
 class Job(Protocol):

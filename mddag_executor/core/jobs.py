@@ -280,7 +280,7 @@ def withhold(t: Tables, s: State, slot: int, vertex: int, now: int) -> None:
     """
     Note that no message starts a vertex of an open job (rule 13).
 
-    The vertex and all after it are not due in this job: a sync among them lacks a leg for good.
+    The vertex and all after it are not due in this job: a sync among them can never be complete.
     """
     base = s.job_base[slot]
     after = [vertex]

@@ -34,7 +34,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     including the time in which it is preempted or suspended.  If a queue comes first while the
     group of its first execution is busy, its entry is set aside in the heap of the group.  When
     the owner completes, the smallest entry of the group returns.  A group of a user's own class
-    lets executions run one by one.  If the owner may begin, it leaves the group for good
+    lets executions run one by one.  If the owner may begin, it leaves the group for ever
     (``leave_group``).  If it may not, it waits as the owner, so that no other execution overtakes
     it (``refuse``, then ``ask_again``).
     In a live run, callbacks of one of a program's executors belong to an *outer group*.  At most a

@@ -173,7 +173,7 @@ class Scheduler:
         elif before >= 0 and state.x_state[x] == WAITING and state.queue_place[queue] <= OUTER:
             change_key(state, queue, state.queue_key[queue])
         state.x_outer[x] = outer
-        if outer < 0:  # it asks for no place any more
+        if outer < 0:  # it no longer needs a place
             state.x_place[x] = NO_PLACE
         if before >= 0:
             call_next(state, before)

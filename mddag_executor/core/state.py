@@ -20,7 +20,7 @@ from mddag_executor.core.tables import DEMOTE, NEVER, Tables
 # suspended.
 IDLE, WAITING, ALONE, RUNNING, SUSPENDED, DONE, DROPPED = range(7)
 
-# Of an execution: whether it has a place in its outer group, or goes on after it has lent that.
+# Whether an execution has a place in its outer group, or continues after it has lent its place.
 NO_PLACE, PLACED, RETURNS = range(3)
 
 # States of a job.  Every ended job is in exactly one of the last six; only recordings of version 2

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 LEAST_NS = 20_000_000
-"""A shorter time is no stop, ns."""
+"""A shorter time does not count as a stop, ns."""
 KEEP_STOPS = 100
 KEEP_MISSES = 2_000
 

@@ -78,7 +78,7 @@ EXPIRE_AFTER_NS = 1_000_000_000
 """An idle job expires this long after its latest deadline, ns."""
 
 UNJUDGED_PERIODS = 10
-"""A sink without a deadline is ordered as if it had one of so many periods of its DAG, …"""
+"""A sink without a deadline is ordered as if it had one of this many periods of its DAG, …"""
 UNJUDGED_NS = 1_000_000_000
 """… and at least this long."""
 

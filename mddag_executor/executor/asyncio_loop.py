@@ -18,7 +18,7 @@ Theory of operation
     it, if it would otherwise sleep too long.  A future that is done makes the execution that
     awaits it ready at once, in the thread that has completed it.
 4.  *Other threads* use ``call_soon_threadsafe`` or ``run_coroutine_threadsafe``, as with any loop.
-    A callback that is no coroutine owns the turnstile for each single call.
+    A callback that is not a coroutine owns the turnstile for each single call.
 5.  *The end.*  Tasks that are not done are cancelled, and a warning names them.
 """
 

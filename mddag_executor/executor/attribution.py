@@ -40,7 +40,7 @@ ROUNDING_NS = 2
 """DDS timestamps are multiples of 2**-32 s: they may be this far outside of the window."""
 
 MANY_UNLIKE = 4
-"""After so many publications in a row the numbers of a publisher are known to have shifted."""
+"""After this many publications in a row the numbers of a publisher are known to have shifted."""
 
 NO_NUMBER = -(2 ** 62)
 """The count of a publication made by a signal handler within another one of its publisher."""

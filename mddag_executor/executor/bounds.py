@@ -106,7 +106,7 @@ REMEMBERED = 4096
 """How many past items of a kind are remembered: stamps of jobs, undeclared names."""
 
 HISTORY = 40
-"""How many of the last changes of threads an ``InvariantError`` tells."""
+"""How many of the last changes of threads an ``InvariantError`` lists."""
 
 LOG_EVERY_S = 10.0
 """The minimum time between two logged warnings of the same kind."""

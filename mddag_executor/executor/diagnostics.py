@@ -97,7 +97,7 @@ class DagWatch:
         self._in_stops = in_stops
         self._sinks = {tally.vertex_name(v): sink for v, sink in tally.sinks_of(dag).items()}
         self._keys = {dag.vertices[i].name: dag.vertices[i].callback.key for i in dag.sinks}
-        # whether silence is no sign of trouble
+        # whether silence is normal
         self._is_quiet = dag.once or dag.sporadic
         self._stale_after = max(thresholds.stale_periods * dag.period_ns, every_ns)
         # the counters at the end of each period of the window, and before it

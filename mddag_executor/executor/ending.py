@@ -9,7 +9,7 @@ Theory of operation
     its context.
 2.  An executor that is not shut down ends when its context ends while it does not spin, or when
     it is destroyed.  Neither can wait for a lock or a thread: a thread that owns any lock may be
-    the one that collects garbage.  So the parked workers are only told to end, and the last of
+    the one that collects garbage.  So the parked workers are only woken to end, and the last of
     them does the rest.
 3.  Therefore nothing that a thread refers to may refer to the executor: threads would keep it
     alive.  They have its methods by ``weakly.weakly``.

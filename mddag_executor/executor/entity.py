@@ -128,7 +128,7 @@ class Entity(ChannelSource):
         self.counts_as_eager = False
         # runs a step in its callback group, if that must be asked (``work.run_in_group``)
         self.gate: Callable_[..., Any] | None = None
-        # its mutually exclusive callback group, which is told of each execution
+        # its mutually exclusive callback group, which is notified of each execution
         self.exclusive: Any = None
         self.address = new_address()
         # entered before a callback runs: it raises once the entity is destroyed

@@ -4,7 +4,7 @@
 What sources see of the worker pool, and the pool of the executor.
 
 The pool (``workers``) collects from the sources, and they report to it; the executor makes the
-pool, which tells it about changes.  Each knows the one above it by a protocol, so that imports
+pool, which reports changes to it.  Each knows the one above it by a protocol, so that imports
 point one way.
 """
 

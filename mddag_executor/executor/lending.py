@@ -58,7 +58,7 @@ class Pool(Protocol):
         """Change the state of a thread."""
 
     def need_threads(self, n_out: int) -> None:
-        """Make a thread if, without so many, there are fewer threads than workers."""
+        """Make a thread if there are fewer than workers, without the ``n_out`` that are lent."""
 
     def call(self) -> None:
         """Wake a thread."""

@@ -24,7 +24,7 @@ def outer_here() -> int:
 
 class OuterGroup:
     """
-    The callbacks of a program's executor, of which so many may run at a time.
+    The callbacks of a program's executor, of which a limited number may run at a time.
 
     It is also what runs the done callbacks of its clients' futures.  It exists as long as the one
     who made it, a node or an unfinished task refers to it; then its number is used again.
@@ -52,7 +52,7 @@ class OuterGroup:
 
     def open(self, limit: int, once: bool = False) -> bool:
         """
-        Let so many callbacks run at a time, or none.
+        Let this many callbacks run at a time, or none.
 
         :param once: only until the next one starts.
         :return: whether one may start now.

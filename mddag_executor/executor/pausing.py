@@ -84,7 +84,7 @@ class Pauses:
         # else the last one that overtook it has just ended
 
     def end(self) -> None:
-        """Let those go on that are overtaken no more."""
+        """Let those executions continue that are no longer overtaken."""
         pool = self._pool
         overtaken = pool.engine.interpreter.overtaken
         for work in [each for each in self.paused if each not in overtaken]:

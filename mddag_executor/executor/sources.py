@@ -33,7 +33,7 @@ from msg_graph.binding import Entity as Declarable
 from rclpy.qos import HistoryPolicy
 
 _MOST_FOREIGN = 8
-"""So many responses to other clients are expected before one's own when one begins to listen."""
+"""This many responses to other clients are expected before the first own one."""
 SERVICE_DEPTH = 10
 """How many requests wait in Python at most: the depth of rclpy's default profile for services."""
 
@@ -309,7 +309,7 @@ class ServiceEntity(ArrivalEntity):
         request, header = taken
         service, pool = self.rclpy_object, self.rooms.pool
         engine = pool.engine
-        # a recording tells requests apart by the time at which they became ready
+        # a recording distinguishes requests by the time at which they became ready
         now = pool.now
         if engine.record is not None or self.source >= 0:
             now = pool.tick()

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 The exception of a task comes out of the spin, as with rclpy's executors, unless it is handled: the
 task was awaited, or got a done callback, before it failed (it is *observed*).  A spin that waits
-for a task (``spin_until_future_complete``) is no observer: it raises the task's exception itself.
+for a task (``spin_until_future_complete``) does not observe it: it raises the exception itself.
 
 With several workers a task may fail before the callback that created it reaches its ``await`` or
 ``result()``.  So the exception of such a task is kept while that callback runs and a reference

@@ -94,7 +94,7 @@ class WorkerThread:
     """
     A thread that runs callbacks.
 
-    :ivar name: its name, in what an ``InvariantError`` tells.
+    :ivar name: its name in the text of an ``InvariantError``.
     :ivar work: the running execution.
     :ivar worker: the number of its last worker in the core.
     :ivar state: what it does; only the pool changes it.

@@ -133,7 +133,7 @@ class Upkeep:
                 self._pool.due.expect(entity)
 
     def _ignore(self, entity: Kind) -> None:
-        """Let arrivals at an entity be collected no more."""
+        """Stop collecting the arrivals at an entity."""
         entity.ignore()
         with self._pool.lock:
             self._pool.forget_eager(entity)

@@ -160,7 +160,7 @@ class Asked:
     """
     Waitables and guard conditions that are asked with one wait set.
 
-    :param more_guards: conditions that are in the set as well, and are no entities.
+    :param more_guards: conditions that are in the set as well, and are not entities.
     :raises InvalidHandle: when one of them has been destroyed.
     """
 
@@ -176,7 +176,7 @@ class Asked:
 
     def ask(self, timeout_ns: int | None) -> tuple[list[Work], list[GuardCondition]]:
         """
-        Return the executions that are ready, and the triggered conditions that are no entities.
+        Return the executions that are ready, and the triggered conditions that are not entities.
 
         :param timeout_ns: see ``FilledSet.wait``.
         """

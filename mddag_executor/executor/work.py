@@ -5,9 +5,9 @@ The unit of work: one execution of a callback, which a user-defined callback gro
 
 Theory of operation
 -------------------
-The core implements rclpy's two kinds of callback groups.  A mutually exclusive group is also told
-of each execution, and may refuse it: other executors may run callbacks of it, for example because
-a node was moved while its callback ran.  Any other group is asked, as by rclpy's
+The core implements rclpy's two kinds of callback groups.  A mutually exclusive group is also
+notified of each execution, and may refuse it: other executors may run callbacks of it, for example
+because a node was moved while its callback ran.  Any other group is asked, as by rclpy's
 executors: ``can_execute`` and ``beginning_execution`` before a callback, and ``ending_execution``
 after it.  This is user code, which may wait for a lock.  So the worker that is to run the callback
 asks, without the engine's lock.
@@ -60,7 +60,7 @@ class _Current(threading.local):
 
 
 current = _Current()
-"""Of the calling thread: ``running``, a ``Runner`` while a callback runs in it."""
+"""For the calling thread: ``running``, a ``Runner`` while a callback runs in it."""
 
 
 def new_steps(coroutine: Any) -> Any:

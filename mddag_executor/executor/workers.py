@@ -227,7 +227,7 @@ class WorkerPool:
     def _post(self, several: list[Work], now: int) -> None:
         for work in several:
             self.engine.ready(work, now)
-            now = self.tick()  # a recording tells them apart by it
+            now = self.tick()  # a recording distinguishes them by it
 
     def resume(self, work: Work) -> None:
         """Make a suspended execution ready to go on."""

@@ -93,7 +93,7 @@ class Host:
     """
     Runs programs in the default context; a context manager.
 
-    :param signals: tells what becomes of signals; None: they are nothing of the host's.
+    :param signals: decides what happens to signals; None: the host does not handle them.
     :param concurrent: the names of the nodes whose callbacks may overlap with each other, and with
         what their program does between its spins, whatever executor they have.
     :ivar executor: runs the nodes of all programs; None before ``start``.
@@ -383,7 +383,7 @@ class Host:
                 isinstance(error, KeyboardInterrupt) and self._is_ending()):
             get_logger('mddag_executor').error(
                 f'--node {guest.program.spec}: its main has raised {describe(error)}: its nodes '
-                'run no more')
+                'no longer run')
 
     def _end_run_after_last(self) -> None:
         if self._all_started and all(g.ended and g.finished for g in self.guests):

@@ -9,8 +9,8 @@ Theory of operation
 2.  While the main thread runs a program, Python's handler of SIGINT is its own one again, which
     raises KeyboardInterrupt in the program, and the program may set handlers of its own and call
     ``loop.add_signal_handler``: all that is as without this package.  rclpy's handlers are in C,
-    and run before those of Python.  In their place, Python's wake-up descriptor tells a thread
-    about each signal, and the thread ends the run if rclpy would have shut the context down
+    and run before those of Python.  In their place, Python's wake-up descriptor reports each
+    signal to a thread, and the thread ends the run if rclpy would have shut the context down
     (``ends_run``).
 3.  A program may take the wake-up descriptor (as asyncio's loops do).  Then its spin reports the
     KeyboardInterrupt that it gets (``interrupted``).
@@ -213,7 +213,7 @@ _given: list[tuple[int, int]] = []
 
 
 def _forget_in_child() -> None:
-    """Let a forked child not tell its parent about its own signals."""
+    """Let a forked child not report its own signals to its parent."""
     if _given:
         with suppress(ValueError):  # another thread than the main one has forked
             signal.set_wakeup_fd(-1)

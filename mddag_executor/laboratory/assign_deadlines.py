@@ -15,8 +15,8 @@ or maximum) of the execution times.  Deadlines are rounded to whole us.
    but no sink gets more than by rule 1; the others share the rest.
 3. A segment that ends before a sink is bounded by one of the sinks after it: the one with the
    shortest critical path.
-4. Of several paths through a sink the shortest deadline counts.  So no requirement is broken for
-   another one.
+4. If several paths go through a sink, the shortest deadline counts, so that all requirements
+   hold.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def _read_values(archive: Any, key: str, name: str) -> Times:
         values: Floats = archive[key].astype(np.float64)
     except (*_DAMAGED, OSError):
         values = np.empty(0)
-    # false for values that are no numbers
+    # false for NaN
     if values.ndim != 1 or not values.size or not np.all((values >= 0) & (values < DAY)):
         raise InputError(
             name, f'the values of {key} are damaged, or no list of ns below one day', _REMEDY)

@@ -5,10 +5,10 @@ Random graphs with one source and a given number of sinks.
 
 Theory of operation
 -------------------
-Callbacks are numbered in a topological order: 0 is the source, the last ones are the sinks.  Of
-each pair of which the first is no sink there is an edge with the given probability (Erdos and
-Renyi).  What then has no predecessor gets one, and what is no sink and has no successor gets one,
-drawn from those that may be it.
+Callbacks are numbered in a topological order: 0 is the source, the last ones are the sinks.  Each
+pair whose first callback is not a sink has an edge with the given probability (Erdos and Renyi).
+Then each callback without a predecessor gets one, and each callback that is not a sink and has no
+successor gets one, drawn from the callbacks that are allowed.
 
 A callback with several predecessors joins their messages (AND), or runs once for each (OR).  As OR
 multiplies what comes after it, a callback that would run more than ``MOST_COPIES`` times for each

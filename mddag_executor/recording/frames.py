@@ -108,7 +108,7 @@ def _bits(flags: Any) -> Any:
 
 
 def named(codes: Any, names: Sequence[str], known: Any = None) -> Any:
-    """Return indices of names as an Arrow array, the names as a dictionary; '' is no name."""
+    """Return indices of names as an Arrow array, the names as a dictionary; '' is null."""
     import pyarrow
     different = list(dict.fromkeys(name for name in names if name))
     if len(different) < len(names):     # some numbers have the same name, or none

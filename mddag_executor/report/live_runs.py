@@ -68,8 +68,8 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
     for each in result.get('exclusion', ()):
         if each['waited_ns'] >= SHOWN_NS:
             yield (f'callbacks of --node {printable(each["program"])} waited '
-                   f'{each["waited_ns"] / 1e9:.2f} s in all, as its executor runs only so many '
-                   'at a time (--concurrent NODE lets them overlap)')
+                   f'{each["waited_ns"] / 1e9:.2f} s in all, as its executor would not run '
+                   'them at the same time (--concurrent NODE lets them overlap)')
     deaf = {name: each['incompatible_qos'] for name, each in result['callbacks'].items()
             if each.get('incompatible_qos') and not each['ran']}
     if deaf:

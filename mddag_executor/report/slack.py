@@ -60,7 +60,7 @@ def _missed_lines(result: Mapping[str, Any]) -> Iterator[str]:
         yield (f'{counted(sum(missed.values()), "deadline")} missed: '
                + listed([f'{name} ({n})' for name, n in missed.items()]))
     if result['left_out']:
-        yield ('left out, because shorter execution times are no remedy: '
+        yield ('left out, because shorter execution times do not help: '
                + listed(result['left_out']))
 
 

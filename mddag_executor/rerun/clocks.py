@@ -170,7 +170,7 @@ class VirtualTime:
         return None
 
     def _warn_of(self, what: str, depth: int) -> None:
-        """Warn of a function that code of a node calls, which is so many calls further up."""
+        """Warn of a function that is called by code of a node, ``depth`` calls further up."""
         if not self._loop.in_run:
             return
         caller = sys._getframe(depth)

@@ -74,7 +74,7 @@ def _align(data: bytearray, at: int, width: int) -> int:
 
 
 def _walk(slot: Any, count: int | None = 1) -> Walk:
-    """Return the walk over so many values of a type; None: their number comes first."""
+    """Return the walk over this many values of a type; None: their number comes first."""
     if isinstance(slot, AbstractNestedType):
         return _walk(slot.value_type, slot.size if isinstance(slot, Array) else None)
     if isinstance(slot, BasicType):

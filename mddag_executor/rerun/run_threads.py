@@ -235,7 +235,7 @@ class RunThreads:
         self, patience_s: float, progress: Callable[[], object], tick: Callable[[], None]
     ) -> None:
         """
-        Run all until the run is over, watched by the calling thread, which is no run_thread.
+        Run all until the run is over, watched by the calling thread, which is not a run thread.
 
         :param patience_s: a run thread that waits for this long is stuck.
         :param progress: returns what changes as long as the run goes on.
@@ -298,7 +298,7 @@ class _StallWatch:
 
 
 def code_position(ident: int) -> str:
-    """Return where a thread is: file and line of the innermost code that is no library's."""
+    """Return where a thread is: file and line of the innermost code outside of libraries."""
     stack = traceback.walk_stack(sys._current_frames().get(ident, sys._getframe()))
     places = [(f'{frame.f_code.co_filename}:{line}', frame.f_globals.get('__name__', ''))
               for frame, line in stack]

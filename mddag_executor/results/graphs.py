@@ -42,8 +42,8 @@ class NecessaryTest(TypedDict):
     reason: str
     """Why the test holds or fails, in words."""
     details: dict[str, Any]
-    """Of the longest path by sink `deadline_ns` and `longest_path_ns`; of the utilisation by DAG
-    its load in cores; of the demand bound `time_ns` and `work_ns`."""
+    """For the longest path: by sink `deadline_ns` and `longest_path_ns`; for the utilisation: by
+    DAG its load in cores; for the demand bound: `time_ns` and `work_ns`."""
 
 
 class CheckedQueueEdge(TypedDict):

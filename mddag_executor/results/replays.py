@@ -493,9 +493,9 @@ class MissPartRare(TypedDict, total=False):
     """Keys of a part of a miss that depend on its cause."""
 
     waiting_job: int
-    """Of a skipped release: the earlier job whose execution still waited, -1: none."""
+    """For a skipped release: the earlier job whose execution still waited, -1: none."""
     topics: list[str]
-    """Of a missing message: the topics of the messages that did not come."""
+    """For a missing message: the topics of the messages that did not come."""
 
 
 class MissPart(MissPartRare):

@@ -37,9 +37,9 @@ class Tolerated(TypedDict):
     """The misses that the declaration tolerates (``tolerate``), and the worst window."""
 
     misses: int
-    """How many misses are tolerated …"""
+    """How many misses are tolerated among any `of` consecutive results."""
     of: int
-    """… of any so many consecutive results."""
+    """Length of the window: the number of consecutive results."""
     worst: int
     """The most results that were missed in any such window."""
 

@@ -81,7 +81,7 @@ def preempts(name: str, preemptive: bool | None, processes: int = 1) -> bool:
     Return whether to preempt under a policy: as requested, else as in the paper's experiment.
 
     :raises PolicyError: when there is no such policy, or it does not support preemption, or not
-        with so many processes.
+        with several processes.
     """
     row = policy(name)
     if processes > 1 and (preemptive or name == ROS2):

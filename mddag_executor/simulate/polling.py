@@ -14,7 +14,7 @@ Theory of operation
     the next poll.  A poll that finds only such executions is the last one at this instant.
 4.  There is no preemption, and one process only.
 
-All waiting executions are in the core's queues, as under any other policy; ``Pool.polled`` tells
+All waiting executions are in the core's queues, as under any other policy; ``Pool.polled`` says
 which of them are in the round.  The core gets to see only the one that comes first.
 """
 

@@ -47,7 +47,7 @@ PARTS = DISPATCH, END, COMPLETE = ('mddag:dispatch', 'ros2:callback_end', 'mddag
 COMPLETED = np.dtype([('place', 'i8'), ('time', 'i8'), ('row', 'i8')])
 """Completions: position in the file, time, row of the execution."""
 _MOST_NESTED = 32
-"""So many executions in a row may have ended while an earlier one went on in their thread."""
+"""This many executions in a row may have ended while an earlier one ran in their thread."""
 _FAR = 1 << 40
 """More than any position in a file."""
 

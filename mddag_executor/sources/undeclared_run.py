@@ -59,7 +59,7 @@ import numpy as np
 _DROP, _MESSAGES_LOST = 'mddag:drop', 'mddag:messages_lost'
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
-# Of so many releases one may exclude the origin of the grid, and one has to exclude others.
+# One in this many releases may exclude the origin of the grid, and one has to exclude others.
 _ONE_OF = 20
 
 

@@ -16,7 +16,7 @@ Theory of operation
 3. *Releases.*  Under this package's executor a source gets its release from ``current_job``.
    Under another executor it is the nominal due time of the timer: rcl's next call time at the
    previous call.  A late call does not make a release later.
-4. *Sensors.*  Sources that are no timers get a stand-in sensor.  One thread (node
+4. *Sensors.*  Sources that are not timers get a stand-in sensor.  One thread (node
    ``/mddag_sensors``, with publishers and clients only, not on any executor, so it occupies no
    worker) publishes on their topics or calls their services at the nominal releases.  A service's
    request is a ``rcl_interfaces/ListParameters``, whose ``depth`` carries the release (ns).
@@ -206,7 +206,7 @@ def callback_of(
 
 
 class Sensor(NamedTuple):
-    """Stand-in for the senders of messages and requests to sources that are no timers."""
+    """Stand-in for the senders of messages and requests to sources that are not timers."""
 
     dags: list[str]
     period_ns: int
@@ -440,7 +440,7 @@ class SyntheticWorkload:
         return self._process in (None, self.task_set.process_of(node))
 
     def _make_sensors(self) -> list[Sensor]:
-        """Make the senders for DAGs whose sources are no timers."""
+        """Make the senders for DAGs whose sources are not timers."""
         sources: dict[str, list[Vertex]] = {}
         for vertex in self.task_set.vertices:
             if not vertex.predecessors and vertex.callback.kind != 'timer':

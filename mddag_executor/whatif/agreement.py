@@ -19,7 +19,7 @@ from mddag_executor.core.tally import Counts, total
 from mddag_executor.whatif.reschedule import Reschedule
 
 POINTS = 5
-"""A difference of so many percentage points of the results in time is not reported."""
+"""A difference of at most this many percentage points is not reported."""
 LEAST_DUE = 50
 
 

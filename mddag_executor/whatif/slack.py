@@ -156,7 +156,7 @@ class Search:
         self._low, self._high = (1.0, MOST) if self._first is None else (LEAST, 1.0)
 
     def _leave_out_hopeless_ones(self) -> None:
-        """Ignore misses for which shorter execution times are no remedy."""
+        """Ignore misses that shorter execution times do not avoid."""
         decisions = self._decisions(self._scaled(ALL, LEAST))
         met = {vertex for kind, _, vertex, *_ in decisions if kind == SINK_IN_TIME}
         self._known = {(vertex, job) for kind, _, vertex, job, *_ in decisions if is_miss(kind)}
@@ -171,7 +171,7 @@ class Search:
 
     def compile_for(self, runs: int) -> None:
         """
-        Compile the core if it pays for so many runs of the whole load.
+        Compile the core if it pays for this many runs of the whole load.
 
         If one callback alone cannot help, its search needs no such run.  So this is called when it
         is known that the searches take long: compiling takes minutes on a busy machine.
@@ -371,7 +371,7 @@ def slack_result(
 
     :param dags: of the result of the run with factor 1; ``requirements``: its paths, if something
         is required of them.
-    :param processes: number of processes, each with so many workers.
+    :param processes: number of processes, each with this many workers.
     """
     names = [vertex.name for vertex in task_set.vertices]
 

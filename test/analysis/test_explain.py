@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs in which deadlines are missed for one known reason, and what is told of them."""
+"""Runs in which deadlines are missed for one known reason, and what `explain` says about them."""
 
 from hypothesis import example, given
 from hypothesis import strategies as st

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Tolerated misses, failed jobs and runs without a job, wherever verdicts are told."""
+"""Tolerated misses, failed jobs and runs without a job, wherever verdicts are shown."""
 
 import json
 from xml.etree import ElementTree

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings that are told callback by callback, for a declaration."""
+"""Recordings that are written callback by callback, for a declaration."""
 
 from mddag_executor import open_recording
 from mddag_executor.analysis.paths import Paths

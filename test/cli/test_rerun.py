@@ -98,7 +98,7 @@ def test_unmodified_programs(drive, tmp_path):
     assert 'heard 49 messages' in first.stdout
     again = mddag(tmp_path, *args, '--expect', 'chatter.mcap', AMENT_PREFIX_PATH=prefix)
     assert 'the same as chatter.mcap' in again.stdout
-    # Of the listener alone: what the talker said is in the bag.
+    # The listener alone: the messages of the talker are in the bag.
     alone = mddag(tmp_path, 'rerun', 'chatter.mcap', graph, '--node', 'their_robot/listener.py',
                   AMENT_PREFIX_PATH=prefix)
     assert 'heard 49 messages' in alone.stdout

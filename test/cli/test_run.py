@@ -144,7 +144,7 @@ def test_fail_on_miss_judges_by_what_the_declaration_tolerates(
 
 @contextmanager
 def started(graph):
-    """Give a synthetic run that goes on until it is told to end."""
+    """Give a synthetic run that continues until a signal ends it."""
     with subprocess.Popen(
         [sys.executable, '-m', 'mddag_executor', 'run', str(graph), '--synthetic', 'sleep',
          '--workers', '3', '--trace', 'out.mcap', '--json', 'result.json'],

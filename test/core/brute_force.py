@@ -113,7 +113,7 @@ class Execution:
 
 class BruteForce:
     """
-    One simulated run; ``misses`` and ``result()`` tell what came out of it.
+    One simulated run; ``misses`` and ``result()`` are its results.
 
     :ivar events: (tick, 'start' | 'end' | 'preempt', worker, DAG, vertex in its DAG, job).
     """
@@ -264,7 +264,7 @@ class BruteForce:
         if self.policy == 'dm':
             sinks = {*self.laxity[job.dag.index, execution.vertex.index]}
             return min(self._deadline(job, sink) for sink in sinks) - job.release
-        if self.policy == 'llf':  # in ns: declared execution times are no multiples of a tick
+        if self.policy == 'llf':  # in ns: declared execution times need not be multiples of a tick
             starts = self.laxity[job.dag.index, execution.vertex.index]
             return job.release * self.tick + min(starts[sink] for sink in sinks)
         if self.policy == 'wc':

@@ -297,7 +297,7 @@ class LiveDriver(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def rejoin(self, data):
-        """One that has lent its worker wants one again; or no more, as nothing would give it."""
+        """One that has lent its worker needs one again, or continues without if none can come."""
         lent = [run for run in self.with_fate(RUNNING) if run.lent]
         waiting = [run for run in self.with_fate(WAITING) if run.began]
         if waiting and data.draw(st.booleans()):

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Outer groups (rule 4): so many executions of a program at a time, none while it is closed."""
+"""Outer groups (rule 4) limit the executions of a program; none runs while one is closed."""
 
 import random
 

@@ -50,7 +50,7 @@ def demand(case):
 @examples(300)
 @given(cases(importance=True), st.integers(5, 60))
 def test_importance_means_nothing_if_late_jobs_are_not_demoted(case, horizon):
-    """They are not under a policy whose keys are no times."""
+    """Policies whose keys are not times never demote them."""
     by_time = case.policy in ('rad', 'gedf', 'llf')
     important = with_times(case, on_late='continue' if by_time else 'demote')
     plain = with_times(case, on_late='continue', importance='normal', tolerate=None)
@@ -236,7 +236,7 @@ def test_no_callback_starves(case, heavier):
 
 
 def test_a_measured_time_that_is_not_renewed_is_forgotten():
-    """Of a callback that runs no more, or seldom, the declared time counts again."""
+    """If a callback no longer runs, or runs seldom, its declared time counts again."""
     scheduler = live(with_times(case_of(timer('a', 10, 10, 4), timer('b', 10, 10, 4))).task_set)
     t, s = scheduler.tables, scheduler.state
     slow = 1000 * TICK

@@ -17,7 +17,7 @@ same if
 
 * the same topics were published on, with the same types;
 * each topic had as many messages, and each service as many responses, give or take a quarter (a
-  slow machine is no difference);
+  slow machine counts as equal);
 * the last message of the topics in ``Program.constant`` and the last response of each service
   were the same;
 * both ran until SIGINT, or neither.
@@ -56,7 +56,7 @@ sys.path.append(str(Path(__file__).parents[1]))
 from ros_domains import claim_domain
 
 TOLERANCE, FEW = 0.25, 3
-"""Counts that differ by this part, or by so many messages, are the same."""
+"""Counts that differ by this part, or by this many messages, are the same."""
 START_S, END_S = 15.0, 45.0
 """How long a program may take to publish first, and to end after SIGINT."""
 LATEST_S = 2.0

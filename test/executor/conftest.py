@@ -77,7 +77,7 @@ def wait_for(condition, seconds=15.0):
 
 
 def matched(*publishers, count=1):
-    """Wait until each publisher has met so many subscriptions."""
+    """Wait until each publisher has met this many subscriptions."""
     assert wait_for(lambda: all(p.get_subscription_count() == count for p in publishers))
 
 

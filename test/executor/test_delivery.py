@@ -184,7 +184,7 @@ def test_work_does_not_wait_for_a_callback_that_goes_on_after_publishing(
 
 
 def test_a_publishing_callback_wakes_the_workers_of_another_executor(make_executor, make_node):
-    """That it will end soon is no reason: it takes from its own executor only."""
+    """It ends soon, but it runs callbacks of its own executor only."""
     nodes, got = [make_node('first'), make_node('second')], [[], []]
     for node, heard in zip(nodes, got):
         node.create_subscription(

@@ -263,7 +263,7 @@ def test_a_wrong_name_is_warned_of_once(
     else:
         line, = warned
         assert f'camera.yaml: {expected}' in line
-    # the last lines repeat it, and tell it from what nothing has started
+    # the last lines repeat it, apart from callbacks that nothing has started
     lines = list(live_lines({**executor.statistics(), 'measured': None}))
     never = [line for line in lines if 'never ran' in line or 'found in no node' in line]
     assert never == ([] if expected is None else [expected.partition(';')[0]])

@@ -370,7 +370,7 @@ def test_a_group_is_free_when_an_executor_ends_before_its_coroutine(make_executo
 
 
 class Tokens(CallbackGroup):
-    """A user's own group: lets so many callbacks run as it has tokens; notes what it is asked."""
+    """A user's own group, which lets a callback run for each token, and notes the calls."""
 
     def __init__(self, tokens=0, are_given_back=False):
         super().__init__()

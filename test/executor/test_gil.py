@@ -48,7 +48,7 @@ def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, h
     def body():
         running.append(1)
         at_once.append(len(running))
-        gate.wait(20.0)  # passes only when so many are there
+        gate.wait(20.0)  # passes only when all parties are there
         compute(5)
         intervals.add(sys.getswitchinterval())
         running.pop()

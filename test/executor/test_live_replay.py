@@ -43,7 +43,7 @@ def is_every(jobs):
 
 
 def every(jobs, seconds):
-    """Return a body that sleeps in each so many-th job."""
+    """Return a body that sleeps in one of this many jobs."""
     return lambda: time.sleep(seconds if is_every(jobs) else 0.0)
 
 

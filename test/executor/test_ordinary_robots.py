@@ -66,7 +66,7 @@ def run_robot(make_executor, make_node, text, path, start=lambda: None):
 
 
 def test_results_that_nothing_was_published_for_are_not_due(make_executor, make_node, tmp_path):
-    """They are no misses, live, as recorded and rescheduled; a silent job ends at once."""
+    """They are not missed, live, as recorded or rescheduled; a silent job ends at once."""
     path = tmp_path / 'run.mcap'
     started = []
     with run_robot(make_executor, make_node, ROBOT, path, partial(started.append, 1)) as (

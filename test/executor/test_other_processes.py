@@ -150,7 +150,7 @@ def test_messages_without_a_stamp_for_a_second_time_and_of_the_future(make_execu
         assert None not in publish(stamped(stamp))
         assert publish(stamped(stamp))[0] is None  # its job has ended
         assert executor.statistics()['dags']['chain']['jobs'] == 1
-        # a stamp of the future is no release before now
+        # a stamp of the future cannot be a release
         before = time.time_ns()
         _, job = publish(stamped(before + 10_000 * MS))
         assert abs(job.release_ns - before) < 1000 * MS

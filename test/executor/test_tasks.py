@@ -64,7 +64,7 @@ def test_other_callbacks_of_an_awaited_future_run_where_rclpy_runs_them(
 # --- with the rclpy that is installed, and as since 7.1.9 ----------------------------------------
 
 # There a future that is awaited hands itself to the task, which goes on by itself when it is done;
-# and a coroutine that goes on before is told off.
+# and a coroutine that continues before gets an error.
 IS_NEWER = hasattr(Task, '_add_resume_callback')
 
 

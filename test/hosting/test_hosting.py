@@ -260,7 +260,7 @@ def test_a_context_of_a_programs_own_is_left_alone(world, mddag):
     (['waits_for_a_task'], ['Traceback', '--node chat:waits_for_a_task: ']),
     (['raises_in_a_callback', 'shuts_down_in_a_callback'], [
         '--node chat:raises_in_a_callback: its main has raised ZeroDivisionError',
-        'its nodes run no more', 'shut down', 'results due'])])
+        'its nodes no longer run', 'shut down', 'results due'])])
 def test_exceptions_come_out_behind_the_summary(world, mddag, names, lines):
     """A callback that shuts rclpy down ends the run, one that raises ends its program."""
     done = mddag('run', 'graph.yaml', '--duration', '50s', *(
@@ -311,7 +311,7 @@ def test_what_does_not_end_is_left_behind(world):
         assert wait_for(lambda: 'blocked' in Path('err.txt').read_text(), 60.0)
         time.sleep(1.0)
         process.send_signal(signal.SIGINT)
-        time.sleep(2 * SAME_SIGNAL_S)       # another one is no second one before
+        time.sleep(2 * SAME_SIGNAL_S)       # before, another one counts as the same
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
         process.wait(60)

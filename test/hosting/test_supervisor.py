@@ -58,7 +58,7 @@ class Case:
 
 
 def test_output_has_the_name_of_the_process_before_each_line(tmp_path):
-    """And Ctrl-C does not reach a process, not even at its start: it is no error of its own."""
+    """And Ctrl-C does not reach a process, not even at its start, so it does not fail."""
     group = 'import os; print(1); print(os.getpgrp() == os.getpid(), end="")'
     case = Case(tmp_path, True, a=group, b='import sys; print("three", file=sys.stderr)')
     assert case.run() == [('a', 0), ('b', 0)]
@@ -155,7 +155,7 @@ def test_a_signal_stops_a_session_wherever_it_interrupts_the_wait():
         sys.settrace(None)
         session.end()
 
-    # So many steps of the interpreter are in `wait` and below before it sleeps, and some more.
+    # More steps of the interpreter than there are in `wait` and below before it sleeps.
     for step in range(1, 60):
         session, answers = Session(Idle()), []
         session.__enter__()

@@ -76,7 +76,7 @@ SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
     # Of consecutive callbacks the first that never ran is the reason.
     (never_ran('/b:m', '/b:s', '/b:e'), ['/b:m never ran in the 0.500 s after the first release']),
     (never_ran('/b:s', '/b:e'), [NO_E.replace('e', 's', 1), NO_E]),
-    # What an overload skips and drops is no difference.
+    # Releases and messages that an overload skips and drops are not drift.
     ({'ran': SKIPPED | {'/b:m': 1}, 'got': {'/b:m': 20, '/b:e': 0}}, []),
     ({'ran': SKIPPED, 'got': {'/b:m': 20, '/b:e': 0}}, [NO_E]),
     ({'ran': SKIPPED, 'got': {'/b:m': 20, '/b:e': 15}}, []),

@@ -20,7 +20,7 @@ TOP, SENSOR = ((GOLDEN / f'{name}.yaml').read_text() for name in ('top', 'parts/
 
 
 def plain(task_set):
-    """Return the task set without what tells of files and lines."""
+    """Return the task set without files and lines."""
     return replace(without_lines(task_set), file='')
 
 

@@ -62,7 +62,7 @@ def test_everything_at_once(case, horizon, judge, stop):
 
 
 SLOW = 400
-"""Times so many times as long are some switch intervals and slices of a machine."""
+"""Times are multiplied by this, so that some are switch intervals and slices of a machine."""
 
 
 def slowed(tables, processes, chances):
@@ -74,7 +74,7 @@ def slowed(tables, processes, chances):
 
 
 def with_everything(load_, tables, chances):
-    """Return a load, slowed, that is different for each job, with all that it may tell."""
+    """Return a load, slowed, that is different for each job, with all that a load may have."""
     jobs = [load_.dags.count(dag) for dag in range(tables.n_dags)]
     sizes = [tables.n_region[dag] for dag in range(tables.n_dags)]
     first = [tables.first_successor[v] for v in tables.first_vertex]

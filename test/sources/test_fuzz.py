@@ -44,7 +44,7 @@ pytestmark = pytest.mark.timeout(180 + 2 * LONG_S)
 
 
 def rounds(count):
-    """Yield so many fixed seeds, or fresh ones for as long as asked."""
+    """Yield this many fixed seeds, or fresh ones for as long as asked."""
     if not LONG_S:
         yield from range(count)
         return

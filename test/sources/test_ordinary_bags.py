@@ -228,7 +228,7 @@ def test_hostile_files(tmp_path):
 
 
 def test_a_folder_says_what_is_in_it(tmp_path):
-    """A folder with a trace of this executor is no bag, and an empty one is nothing."""
+    """A folder with a trace of this executor is not a bag, and an empty one is nothing."""
     folder = tmp_path / 'run'
     folder.mkdir()
     with TraceFile(folder / 'a.mcap') as file:
@@ -291,7 +291,7 @@ def test_a_message_at_a_time_that_cannot_be(tmp_path, storage, odd):
 
 @pytest.mark.parametrize('storage', [MCAP, SQLITE])
 def test_stamps_of_each_byte_order_and_of_short_messages(tmp_path, storage):
-    """What is no stamp is unknown, each message by itself; one of them is at the file's end."""
+    """A stamp that cannot be read is unknown; one such message is at the end of the file."""
     plain = b'\0\1\0\0' + struct.pack('<iI', 5, 6) + bytes(8)
     contents = [plain, b'\0\0\0\0' + struct.pack('>iI', 7, 8) + bytes(8), b'\0\0', b'', plain[:11],
                 b'\0\2' + plain[2:], b'\1' + plain[1:], plain[:4] + struct.pack('<iI', -1, 0),
@@ -307,7 +307,7 @@ def test_stamps_of_each_byte_order_and_of_short_messages(tmp_path, storage):
 
 @pytest.mark.parametrize('storage', [MCAP, SQLITE])
 def test_messages_are_kept_in_the_order_of_the_file(tmp_path, storage):
-    """Of several topics, also those of one time: a rerun delivers them in that order."""
+    """A rerun delivers messages of several topics in that order, even those of one time."""
     wanted = [(('/b', '/a', '/c')[k % 3], BEGIN + k // 4) for k in range(60)]
     path = write(tmp_path / 'bag', dict.fromkeys(('/a', '/b', '/c'), HEADER), [
         (topic, time, bytes(8)) for topic, time in wanted], storage)

@@ -140,7 +140,7 @@ def test_the_same_run_gets_the_same_verdicts(tmp_path, call):
 
 
 def test_dropped_messages_and_callbacks_of_actions_are_no_damage(run):
-    """Of the callback of an action, a client or a task only the name is recorded."""
+    """Only the name of the callback of an action, a client or a task is recorded."""
     run.add('rclcpp_callback_register', 0, 77, '/arm: ActionServer (waitable)')
     for job in range(3):
         run.runs(GRAB, 100 * job, 100 * job + 2, 100 * job + 1)

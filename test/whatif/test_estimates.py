@@ -30,7 +30,7 @@ def late(n_workers, *executions, holding=()):
 
 
 COMPUTE = [
-    # who overtakes and who only waits could begin at once; the machine tells why they did not
+    # one overtakes, one only waits: both could begin; the machine is why they did not
     (3, None, 4 * MS, 5 * MS + 7, 6 * MS), (0, None, 0, 30, 10 * MS),
     (1, None, 0, 10 * MS + 50, 20 * MS), (4, None, 12 * MS, 13 * MS + 9, 22 * MS),
     (2, None, 15 * MS, 20 * MS + 60, 30 * MS)]

@@ -131,7 +131,7 @@ def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path)
 
 
 def test_pieces_are_added_up_and_legs_are_not(tmp_path):
-    """A coroutine's pauses are no execution; a leg that completes nothing loads the workers."""
+    """A coroutine's pauses do not count; a leg that completes nothing loads the workers."""
     trace = Written(tmp_path / 'a.mcap', """\
 mddag: 1
 nodes:

@@ -116,7 +116,7 @@ nodes:
     assert result['load']['breaks'] == '/some:run'
     out = call('slack', path).stdout
     assert out.startswith('30 deadlines missed: /every:run (30)\n')
-    assert 'left out, because shorter execution times are no remedy: /every:run' in out
+    assert 'left out, because shorter execution times do not help: /every:run' in out
 
 
 def test_where_nothing_was_due_nothing_is_proven(tmp_path, call):

@@ -4,8 +4,8 @@
 The tests must fail for an executor that is broken: it is broken once in each way that matters.
 
 Each mutation gets a run of its own, in a child process, of a few quick tests of this project.  One
-of them has to fail.  That a run hangs until its time is over is no way to find a mistake: it does
-not count, and is told apart.
+of them has to fail.  A run that hangs until its time is over has not found the mistake: it does
+not count, and is reported as such.
 
 In a child this file is a plugin of pytest: MDDAG_MUTATION has the changes as JSON, which are made
 when a file is imported.
@@ -30,11 +30,11 @@ ROOT = HERE.parents[2]
 TESTS = HERE.parent.relative_to(ROOT)
 
 HUNG_S = 50
-"""After so many seconds a test of a child hangs."""
+"""After this many seconds a test of a child hangs."""
 RUN_S = 170
 """A run that takes longer is ended."""
 IN_PARALLEL = 3
-"""So many runs at a time: their tests mostly wait."""
+"""This many runs at a time: their tests mostly wait."""
 AT_ONCE_S = 4.0
 """A test that has failed sooner has not waited for one of its own time-outs, which are 5 s."""
 
