@@ -28,13 +28,15 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU for
     ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
     ``SWITCH_INTERVAL_S``.  It also did if, for a quarter of the time, it was not ready to run and
-    no other thread computed.  Anything else is unclear, and counts only after ``LATELY`` checks,
-    so that the GIL is not withheld from others for ever.
+    no other thread computed.  The threads that check compute as well, for as long as the shortest
+    interval.  If the thread got no CPU meanwhile, they do not count: it would have got the GIL
+    between two checks, when they gave that away.  Anything else is unclear, and counts only after
+    ``LATELY`` checks, so that the GIL is not withheld from others for ever.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator, Mapping
 from contextlib import contextmanager
 import ctypes
 import os
@@ -273,6 +275,19 @@ class _Reading(NamedTuple):
     own: int
     process: int
     schedule: Schedule
+    resting: Mapping[Hashable, int]
+
+    def others_since(self, last: _Reading) -> int:
+        """Return for how long other threads, but those that check, have computed, ns."""
+        others = (self.process - self.own) - (last.process - last.own)
+        if self.schedule.slices == last.schedule.slices >= 0:
+            others -= sum(
+                used - last.resting[key] for key, used in self.resting.items()
+                if key in last.resting)
+        return max(0, others)
+
+
+_NONE: Mapping[Hashable, int] = {}
 
 
 class GilCheck:
@@ -318,15 +333,20 @@ class GilCheck:
         self.subject = None
         self.at = NEVER
 
-    def waits(self, ident: int, tid: int, now: int) -> bool:
+    def waits(
+        self, ident: int, tid: int, now: int, resting: Mapping[Hashable, int] = _NONE
+    ) -> bool:
         """
         Return whether the thread has waited for anything but the GIL since the last check.
 
         :param ident: the thread's id in Python; ``tid``: its native id.
         :param now: monotonic ns.
+        :param resting: the CPU times of the threads that only check and wait, ns; the key of each
+            changes when it has run anything else.
         """
         last = self._last
-        new = self._last = _Reading(now, cpu_ns(ident), process_time_ns(), schedule_of(tid))
+        new = self._last = _Reading(
+            now, cpu_ns(ident), process_time_ns(), schedule_of(tid), resting)
         self._step = self._first if last is None else min(2 * self._step, LAST_CHECK_NS)
         self.at = now + self._step
         if last is None:
@@ -338,7 +358,7 @@ class GilCheck:
         if new.schedule.is_asleep:
             if passed >= CHECK_NS and new.schedule.slices == last.schedule.slices >= 0:
                 return True
-            others = max(0, new.process - last.process - own)
+            others = new.others_since(last)
             delayed = new.schedule.delay_ns - last.schedule.delay_ns
             if 4 * (passed - others - delayed) >= passed:
                 return True

@@ -9,7 +9,7 @@ checks this itself (``pausing``), so no other thread does meanwhile.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
 from mddag_executor.core import NEVER
@@ -38,6 +38,9 @@ class Threads(Protocol):
 
     def thread_of(self, work: Work) -> Thread | None:
         """Return the thread that runs an execution."""
+
+    def cpu_of_resting(self) -> dict[Hashable, int]:
+        """Return the CPU times (ns) of the threads that run no callback: see ``GilCheck``."""
 
 
 class HolderCheck:
@@ -135,7 +138,8 @@ class HolderCheck:
             self._check.end()
         elif holder is not self._check.subject:  # one of several short callbacks in a row
             self._watch(now)
-        elif self._check.waits(thread.ident, thread.vtid, now):
+        elif self._check.waits(
+                thread.ident, thread.vtid, now, self._pool.cpu_of_resting()):
             self._check.end()
             self._pool.engine.stop_holding(holder)
             self._pool.pauses.end()

@@ -3,6 +3,7 @@
 """The engine by itself, without threads and clocks; its invariants, each broken once."""
 
 import threading
+from time import process_time_ns, sleep
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -15,7 +16,7 @@ from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import CHECK_PART, GilCheck, GilHabit
+from mddag_executor.executor.gil import CHECK_PART, cpu_ns, GilCheck, GilHabit, schedule_of
 from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest
@@ -541,6 +542,34 @@ def test_the_successor_of_a_callback_that_waits_starts_within_a_millisecond():
     engine.arrived(Work(entity_of(engine, task_set, 0, 0), print), None, 0, -1, 0)
     patience = engine.interpreter.patience()
     assert patience + patience // CHECK_PART < MS
+
+
+def test_the_threads_that_check_do_not_count_as_computing():
+    """
+    They compute for as long as the shortest interval between two checks.
+
+    A thread that got no CPU meanwhile did not wait for the GIL, which they gave away.
+    """
+    ended = threading.Lock()
+    ended.acquire()
+    sleeper = threading.Thread(target=ended.acquire, daemon=True)
+    sleeper.start()
+    tid, me = sleeper.native_id, threading.get_ident()
+    while not schedule_of(tid).is_asleep:
+        sleep(0.001)
+    found = []
+    for before, after in ((0, 0), (0, 1)):  # the second time, the thread has run a callback
+        check = GilCheck()
+        check.begin(sleeper, 0, 0, MS)
+        began = process_time_ns()
+        check.waits(sleeper.ident, tid, 0, {(me, before): cpu_ns(me)})
+        while process_time_ns() < began + MS:
+            pass
+        used = min(process_time_ns() - began, 2 * MS - 1)
+        found.append(check.waits(sleeper.ident, tid, used, {(me, after): cpu_ns(me)}))
+    ended.release()
+    sleeper.join()
+    assert found == [True, False]
 
 
 def test_the_time_of_pauses_does_not_count_as_held():
