@@ -47,11 +47,11 @@ from typing import Any, TYPE_CHECKING
 
 from mddag_executor.executor.attribution import (
     Announced,
+    header_stamp,
     NO_ORIGIN,
     Origin,
     Publication,
     PublisherNumbers,
-    stamped_release,
 )
 from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.hearing import Allowance, is_plausible
@@ -224,7 +224,8 @@ class Announcements:
         if isinstance(origin, Announced):
             release = origin.release + self._clock.offset_ns
         elif origin is None and work.entity.remote_publishers:
-            release, stamp = stamped_release(work.args[0], self._clock)
+            stamp = header_stamp(work.args[0])
+            release = self._pool.stamped_releases.release(stamp, work.entity.topic, now)
         self._engine.arrived(work, origin, release, stamp, now)
 
     def _note(

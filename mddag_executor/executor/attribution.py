@@ -31,9 +31,9 @@ import threading
 from time import time_ns
 from typing import Any, NamedTuple
 
-from mddag_executor.clocks import TraceClock
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import MOST, REMEMBERED
+from mddag_executor.executor.stamps import StampedReleases
 from msg_graph import TaskSet
 
 ROUNDING_NS = 2
@@ -340,26 +340,21 @@ class Attribution:
         return self._release_from[dag] == 'arrival'
 
     def release_of(
-        self, dag: int, message: Any, source_timestamp: int, now: int, clock: TraceClock
+        self, dag: int, topic: str, message: Any, source_timestamp: int, now: int,
+        releases: StampedReleases,
     ) -> tuple[int, int]:
         """
         Return the release of the job that a source's message starts, on the trace's clock.
 
-        :param now: the time of its arrival.
+        :param topic: of the message; ``now``: the time of its arrival.
         :return: the release, and the header's stamp if the release was taken from it, else -1.
         """
         kind = self._release_from[dag]
         if kind == 'source_timestamp':
-            return clock.of_system(source_timestamp), -1
-        release, stamp = (now, -1) if kind == 'arrival' else stamped_release(message, clock)
+            return releases.clock.of_system(source_timestamp), -1
+        stamp = -1 if kind == 'arrival' else header_stamp(message)
         # raw, without header or stamp: only its arrival is known
-        return now if stamp < 0 else release, stamp
-
-
-def stamped_release(message: Any, clock: TraceClock) -> tuple[int, int]:
-    """Return the release by the stamp of a message's header, and the stamp."""
-    stamp = header_stamp(message)
-    return clock.of_system(stamp), stamp
+        return now if stamp < 0 else releases.release(stamp, topic, now), stamp
 
 
 def header_stamp(message: Any) -> int:

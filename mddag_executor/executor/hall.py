@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from mddag_executor.clocks import TraceClock
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.loop import EventLoop
+from mddag_executor.executor.stamps import StampedReleases
 from mddag_executor.executor.work import Work
 
 
@@ -54,6 +55,7 @@ class Hall(Protocol):
 
     engine: Engine
     clock: TraceClock
+    stamped_releases: StampedReleases
     loop: EventLoop
     announcements: Announced | None
     fail: Callable[[BaseException], None]

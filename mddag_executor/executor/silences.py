@@ -109,9 +109,10 @@ class Silences:
         begin = time.thread_time_ns()
         stamp, dag, vertex, topic = _ENTRY.unpack(message.data)
         others, now = self._engine.other_processes, self._pool.tick()
-        release = self._pool.clock.of_system(stamp)
+        releases = self._pool.stamped_releases
         if (topic < len(self._topics) and others is not None and others.is_stamped(dag, vertex)
-                and is_plausible(release, now)):
-            self._engine.hear_silent(
-                Announced(stamp, dag, vertex, release), self._topics[topic], now)
+                and (releases.is_other or is_plausible(releases.clock.of_system(stamp), now))):
+            name = self._topics[topic]
+            release = releases.release(stamp, name, now)
+            self._engine.hear_silent(Announced(stamp, dag, vertex, release), name, now)
         self._allowance.spend(time.thread_time_ns() - begin)

@@ -23,7 +23,7 @@ from functools import partial
 from typing import Any
 
 from mddag_executor.executor import compat
-from mddag_executor.executor.attribution import Publication, stamped_release
+from mddag_executor.executor.attribution import header_stamp, Publication
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.gaps import Gaps
 from mddag_executor.executor.kinds import ListenerEntity, Rooms
@@ -199,12 +199,14 @@ class SubscriptionEntity(ArrivalEntity):
         release = header = -1
         if self.source >= 0:
             release, header = engine.attribution.release_of(
-                engine.tables.dag_of[self.source], message, stamp, now, pool.clock)
+                engine.tables.dag_of[self.source], self.topic, message, stamp, now,
+                pool.stamped_releases)
         elif self.targets:
             origin = publication.origin if publication is not None else engine.attribution.find(
                 self.topic, stamp, info.get('publication_sequence_number'))
             if origin is None and self.remote_publishers:
-                release, header = stamped_release(message, pool.clock)
+                header = header_stamp(message)
+                release = pool.stamped_releases.release(header, self.topic, now)
         engine.arrived(work, origin, release, header, now)
 
     def collect_published(self, publication: Publication | None) -> bool:

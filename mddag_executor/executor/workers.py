@@ -64,10 +64,12 @@ from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
 from mddag_executor.executor.pausing import can_pause, Pauses
 from mddag_executor.executor.shutdown import is_over
+from mddag_executor.executor.stamps import StampedReleases
 from mddag_executor.executor.threads import ThreadState, WorkerThread
 from mddag_executor.executor.timers import Fired, TimerQueue
 from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Destroyed, Refused, Work
+from msg_graph.errors import printable
 from rclpy.logging import get_logger
 
 if TYPE_CHECKING:
@@ -104,6 +106,7 @@ class WorkerPool:
         self.is_recorded = engine.record is not None
         self.clock = clock
         self.offset = clock.offset_ns
+        self.stamped_releases = StampedReleases(clock, self._warn)
         # reentrant only to know its owner: a signal handler may run inside
         self.lock = engine_lock(engine, self._story)
         # the last changes of threads: time, name, and new state
@@ -220,6 +223,11 @@ class WorkerPool:
         """Call a function as soon as the lock is free."""
         self.unlocked_calls.append(function)
         self.loop.wake()
+
+    def _warn(self, text: str) -> None:
+        """Log a warning; the caller owns the lock."""
+        self.unlocked_calls.append(
+            partial(get_logger('mddag_executor').warning, printable(text)))
 
     def post(self, several: list[Work]) -> None:
         """Make undeclared executions ready."""

@@ -39,6 +39,7 @@ from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.publishing import state_of
 from mddag_executor.executor.sources import SubscriptionEntity
+from mddag_executor.executor.stamps import StampedReleases
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.durations import Durations
@@ -102,7 +103,7 @@ class Messages:
         self.offered: dict[str, list[Outlet]] = {}
         self._engine = loop.engine
         self._recording = recording
-        self._clock = clock
+        self._releases = StampedReleases(clock, loop.warn)
         self._times = times
         self._outputs = outputs
         self._outlets: dict[Any, Outlet] = {}
@@ -317,7 +318,8 @@ class Messages:
         release = stamp = -1
         if entity.source >= 0:
             release, _ = engine.attribution.release_of(
-                engine.tables.dag_of[entity.source], message, source_stamp, now, self._clock)
+                engine.tables.dag_of[entity.source], entity.topic, message, source_stamp, now,
+                self._releases)
             stamp = header_stamp(message)
         elif origin is None and entity.remote_publishers:
             release, stamp = now, header_stamp(message)

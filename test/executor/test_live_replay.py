@@ -18,6 +18,7 @@ from msg_graph import loads
 import pytest
 from rclpy.duration import Duration
 from rclpy.task import Future
+from rclpy.time import Time
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
@@ -201,6 +202,34 @@ def test_what_is_late_when_it_arrives_is_late_after_its_release(
     outcome = replay(path)
     assert outcome.warnings == []
     assert 10 < late(outcome.result()) == late(executor.statistics())
+
+
+@pytest.mark.parametrize('hours', [-500_000, -1, 1])
+def test_a_stamp_of_another_clock_is_no_release(
+        hours, make_executor, make_node, tmp_path, capfd):
+    # of simulated time, a played bag, or a machine whose clock is wrong
+    text = graph(
+        played='name: cb, subscription: /old, period: 10ms, release_from: header_stamp, '
+               'deadline: 10s')
+    path, node, got = tmp_path / 'played.mcap', make_node('played'), []
+    publisher = node.create_publisher(Header, '/old', 10)
+    node.create_subscription(Header, '/old', got.append, 10)
+    executor = make_executor(loads(text, 'g.yaml'), trace=str(path), nodes=[node])
+    begin = max(100 * 10**9, time.time_ns() + hours * 3600 * 10**9)
+    with Spinning(executor):
+        for step in range(10):
+            publisher.publish(Header(
+                stamp=Time(nanoseconds=begin + step * 10_000_000).to_msg()))
+            assert wait_for(lambda: len(got) > step)
+    sink = executor.statistics()['dags']['/played']['sinks']['/played:cb']
+    assert sink['completed'] == 10 and not sink['late']
+    replayed = replay(path).result()['dags']['/played']['sinks']['/played:cb']
+    assert (replayed['completed'], replayed['late']) == (10, 0)
+    warnings = [line for line in capfd.readouterr().err.splitlines() if 'header stamps' in line]
+    assert len(warnings) == 1
+    assert f'/old: the header stamps are {abs(begin - time.time_ns()) / 1e9:.0f}'[:-1] in (
+        warnings[0])
+    assert ('ahead of' if hours > 0 else 'behind') in warnings[0]
 
 
 def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):
