@@ -282,6 +282,10 @@ def find(
     times[runs, RAN_USUALLY] = usually[runs]
     times[runs] += _ran_long(spans[runs], (left - usually)[runs], usual, pool)
     _pending(rows, spans, times, left, never, pool, is_source)
+    # what kept the execution before a skipped release waiting meanwhile
+    skips = times[:, SKIPPED] > 0
+    instead = np.full(len(rows), WAITED)
+    instead[of[skips]] = _waits(spans[skips], left[skips], pool, is_source).argmax(axis=1)
     waits = kinds == _WAIT
     if waits.any():
         times[waits] += _waits(spans[waits], left[waits], pool, is_source)
@@ -302,7 +306,7 @@ def find(
     short: Mask = (excess == 0) | ((rows['kind'] == SINK_LATE) & (excess < lateness))
     amounts = np.where(short[:, np.newaxis], total[:, :len(CAUSES)], unusual)
     amounts[short, RAN_LONG] += total[short, RAN_USUALLY]
-    causes = _causes(rows, total, amounts, pool, never, is_source)
+    causes = _causes(rows, total, amounts, instead, pool, never, is_source)
     which, cause = np.nonzero(times)
     parts = table_of(PARTS_OF, len(which), cause=cause, ns=times[which, cause], **{
         name: spans[name][which] for name in ('miss', 'vertex', 'begin', 'end', 'place')})
@@ -434,9 +438,15 @@ def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:
 
 
 def _causes(
-    rows: Table, total: Ints, amounts: Ints, pool: Pool, never: Never, is_source: Any
+    rows: Table, total: Ints, amounts: Ints, instead: Ints, pool: Pool, never: Never,
+    is_source: Any,
 ) -> Ints:
-    """Return the cause of each miss; ``amounts`` are the times that are compared."""
+    """
+    Return the cause of each miss.
+
+    :param amounts: the times that are compared.
+    :param instead: the causes of skipped releases if the job that waited had no miss.
+    """
     credit = np.zeros(len(rows), dtype=np.int64)    # time that the machine may have caused
     for stall in pool.stalls:
         credit[delayed_by(rows, stall)] += stall[1] - stall[0]
@@ -452,18 +462,22 @@ def _causes(
         np.isin(rows['kind'], (SINK_EXPIRED, SINK_ABORTED))
         & ((total[:, [*NO_MESSAGE, SKIPPED]].sum(axis=1) > 0) | (amounts.max(axis=1) == 0)))
     causes[given_up] = _given_up(
-        rows, given_up, causes, np.where(after_stall, MACHINE, RELEASED_LATE), never, is_source)
+        rows, given_up, causes, np.where(after_stall, MACHINE, RELEASED_LATE), instead, never,
+        is_source)
     return causes
 
 
 def _given_up(
-    rows: Table, which: Ints, causes: Ints, skipped: Ints, never: Never, is_source: Any
+    rows: Table, which: Ints, causes: Ints, skipped: Ints, instead: Ints, never: Never,
+    is_source: Any,
 ) -> Ints:
     """
     Return the causes of misses whose jobs ended early.
 
     :param causes: of all misses.
     :param skipped: causes of skipped releases for which no execution waited.
+    :param instead: causes of skipped releases if the job that waited had no miss at the sink: its
+        result was not due, for instance.
     """
     found = causes[which]
     kind, job, at, release, until = (
@@ -480,8 +494,9 @@ def _given_up(
     of = dict(zip(
         zip(rows['sink'][~raised].tolist(), rows['job'][~raised].tolist()),
         causes[~raised].tolist()))
-    found[waits] = [of.get(key, WAITED) for key in zip(
-        rows['sink'][which[waits]].tolist(), before[waits].tolist())]
+    found[waits] = [of.get((sink, job), cause) for sink, job, cause in zip(
+        rows['sink'][which[waits]].tolist(), before[waits].tolist(),
+        instead[which[waits]].tolist())]
     return found
 
 
@@ -498,7 +513,9 @@ def behind(
     """
     every, rows = found.parts, found.misses
     share = 10 * every['ns'] >= (rows['until'] - rows['release'])[every['miss']]
-    chosen = np.flatnonzero(np.isin(every['cause'], _WAITS) & share)
+    # a skipped release waited for what the execution before it waited for
+    kinds = np.where(every['cause'] == SKIPPED, found.causes[every['miss']], every['cause'])
+    chosen = np.flatnonzero(np.isin(kinds, _WAITS) & share)
     waits: dict[int, list[tuple[int, int]]] = {}
     for place in distinct(every['place'][chosen]).tolist():
         keys = [key for key in runs if key[1] == place]
@@ -509,10 +526,10 @@ def behind(
         parts = every[mine]
         begins, ends = parts['begin'], parts['end']
         times = np.array([runs[key].within(begins, ends) for key in keys])
-        waited = np.isin(parts['cause'], _ON_WORKERS)
+        waited = np.isin(kinds[mine], _ON_WORKERS)
         times[:, waited] = [
             on_workers[key].within(begins[waited], ends[waited]) for key in keys]
-        grouped = parts['cause'] == GROUP
+        grouped = kinds[mine] == GROUP
         for vertex in distinct(parts['vertex'][grouped]).tolist():
             others = [i for i, callback in enumerate(callbacks)
                       if group_of.get(vertex, -1) != groups.get(callback, -2)]

@@ -490,7 +490,7 @@ class Explanation:
         missed, causes, parts, too_short = self.found
         sinks, cause_of = missed['sink'].tolist(), causes.tolist()
         of, kind = parts['miss'], parts['cause']
-        mine = np.flatnonzero((kind == causes[of]) | (
+        mine = np.flatnonzero((kind == causes[of]) | (kind == SKIPPED) | (
             (kind == RAN_USUALLY) & (causes[of] == RAN_LONG) & too_short[of]))
         for i, miss, vertex, ns in zip(mine.tolist(), *(
                 parts[name][mine].tolist() for name in ('miss', 'vertex', 'ns'))):

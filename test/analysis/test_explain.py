@@ -207,6 +207,26 @@ def test_an_undeclared_callback_may_hold_the_interpreter(aborted, tmp_path, call
             'replay', path, '--reschedule').stdout
 
 
+def test_a_release_is_skipped_for_what_the_one_before_waited_for(tmp_path):
+    # whose result was not due, so that it has no cause of its own; one of two workers is free
+    trace = Written(tmp_path / 'run.mcap', VICTIM.replace('publishes', 'may_publish'), 2)
+    trace.add('rcl_node_init', 0, 5, 5, 'sensor', '/')
+    trace.add('rcl_publisher_init', 0, 7, 5, 7, '/data', 10)
+    for job in range(10):
+        release = job * 1000
+        trace.piece(-1, -1, -1, release, release + 50)
+        trace.release(0, 2 * job, release)
+        trace.release(0, 2 * job + 1, release + 20, noticed=release + 35)
+        trace.add('expire', release + 35, 0, 2 * job + 1)
+        trace.run(0, TICK, 2 * job, release + 50, release + 51, ready=release, worker=1)
+    path = trace.end(10000)
+    result = explained(path)
+    assert result['causes']['interpreter'] == result['missed'] == 10
+    mostly, = replay(path).explanation.mostly()
+    assert mostly == {**mostly, 'vertex': '/sensor:tick', 'ns': 15 * MS}
+    assert mostly['behind'] is not None
+
+
 FOLLOWED = SYNC.replace('deadline: 22ms', 'publishes: [/out]') + """\
   - {node: /after, callbacks: [{name: act, subscription: /out, deadline: 22ms}]}
 """

@@ -220,7 +220,7 @@ def test_a_stamp_of_another_clock_is_no_release(
         for step in range(10):
             publisher.publish(Header(
                 stamp=Time(nanoseconds=begin + step * 10_000_000).to_msg()))
-            assert wait_for(lambda: len(got) > step)
+            assert wait_for(lambda n=step + 1: len(got) == n)
     sink = executor.statistics()['dags']['/played']['sinks']['/played:cb']
     assert sink['completed'] == 10 and not sink['late']
     replayed = replay(path).result()['dags']['/played']['sinks']['/played:cb']
