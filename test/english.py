@@ -94,6 +94,9 @@ PATTERNS = (
     Pattern("begin with the subject: not 'Of a callback …'",
             r'(?:^|[.;] |\* |\d\. )Of (?:a|an|the|each|its|several|all) ',
             'Of a DAG they end together.'),
+    Pattern("write 'the result of'",
+            r'\bwhat (?:came|comes|becomes|became) of\b|\bWhat came of\b',
+            'It returns what came of the run.'),
     Pattern("write 'for ever'", r'\bfor good\b', 'It starves for good.'),
 )
 

@@ -13,7 +13,7 @@ from typing import NoReturn
 from mddag_executor.errors import UsageError
 
 _REST = ('--', '--ros-args')
-"""What follows one of these is not for the parser."""
+"""Words after one of these are not for the parser."""
 
 
 class Parser(argparse.ArgumentParser):

@@ -132,7 +132,7 @@ Of the calling thread: ``steps``, the coroutine of which a step runs in it; ``is
 inside the turnstile.
 """
 
-# What is safe in any thread, or is not for callbacks.
+# Attributes that are safe in any thread, or not meant for callbacks.
 _UNGUARDED = {
     'call_soon_threadsafe', 'run_forever', 'run_until_complete', 'stop', 'is_running',
     'is_closed', 'close', 'shutdown_asyncgens', 'shutdown_default_executor', 'get_debug',

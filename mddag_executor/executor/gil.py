@@ -185,7 +185,7 @@ class Measurement:
     """
     The CPU times during an execution; they update the ``habit`` at the end, unless it rests.
 
-    What passes between ``pause`` and ``resume``, while it waits without a worker, does not count.
+    The time between ``pause`` and ``resume``, while it waits without a worker, does not count.
     """
 
     __slots__ = ('_habit', '_process', '_preempted', '_own', '_start', '_sums')

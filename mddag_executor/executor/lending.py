@@ -133,7 +133,7 @@ class Lending:
                 return
             is_first = engine.rejoin(work, now)
             self.rejoining[work] = me
-            # what waits already is chosen by another thread, as this one cannot run it
+            # another thread chooses callbacks that wait already, as this one cannot run them
             step = engine.step(me.worker, now) if is_first else engine.advice(now)
             if step.work is not None:
                 self.hand_over(step)

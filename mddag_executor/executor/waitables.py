@@ -236,7 +236,7 @@ class WaitableSource(ChannelSource):
         new = None if before is None else [each.rclpy_object for each in self._without(before)]
         with self._lock:  # announcements meanwhile must not also fill the wait set
             self._set.parts(lambda kind, address: set_listener(kind, address, self.fd), new)
-        # what ``before`` was about to be asked for, it is not asked for any more
+        # arrivals that were announced to ``before`` are collected here
         if self._has_more or before is not None:
             self._ask()
 

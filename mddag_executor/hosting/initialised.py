@@ -53,7 +53,7 @@ def _init(context: Context | None, arguments: list[str]) -> None:
     """
     Initialise a context.
 
-    What native code writes to standard error is shown only when there is no exception: else it is
+    Output of native code on standard error is shown only when there is no exception: else it is
     the same once more.
     """
     init = partial(rclpy.init, args=arguments, context=context,

@@ -200,11 +200,11 @@ class _Run:
                 executor.set_judging(True, self._begin_of_several())
                 session.wait(self._options.seconds)
         except MddagError as error:
-            # What a callback raised says more than that its program failed to start.
+            # The exception of a callback says more than that its program failed to start.
             if session.error is None:
                 if isinstance(error, ProgramFailed):
                     error.status = MainFailed.status
-                elif self._part is not None:  # what it exits with is none of the run's
+                elif self._part is not None:  # its exit status is not that of the run
                     error.status = MddagError.status
                 raise
         left = host.end(session.is_patient)
@@ -216,7 +216,7 @@ class _Run:
         errors = [guest.error for guest in host.guests
                   if guest.error is not None and not (
                       guest in left and isinstance(guest.error, KeyboardInterrupt))]
-        # what went wrong says more than that it was interrupted
+        # the error says more than that the run was interrupted
         errors.sort(key=lambda error: isinstance(error, KeyboardInterrupt))
         return self._result(
             session.error or next(iter(errors), None), guests=host.guests,

@@ -19,7 +19,7 @@ class RunWarning(UserWarning):
 
 def run(options: RunOptions) -> RunResult:
     """
-    Run nodes as `mddag run` does, until the run ends; return what came of it.
+    Run nodes as `mddag run` does, until the run ends; return its result.
 
     It may be called again and again in one process, while rclpy is not initialised.  From the main
     thread, Ctrl-C ends the run.  Warnings are issued as ``RunWarning``.

@@ -45,7 +45,7 @@ _PROBE_TIMEOUT_S = 120.0
 
 
 def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> RunResult:
-    """Run nodes in several processes until the run ends; return what came of it."""
+    """Run nodes in several processes until the run ends; return its result."""
     for spec in options.nodes:
         if not isinstance(spec, str):
             raise UsageError(f"--node {spec!r}: several processes need its name: give "

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What came of a run."""
+"""The result of a run."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ProgramEnd:
 @dataclass(frozen=True)
 class RunResult:
     """
-    What came of a run that has ended.
+    The result of a run that has ended.
 
     :ivar values: all of it (``to_json``).
     :ivar programs: how each program ended; empty with several processes.

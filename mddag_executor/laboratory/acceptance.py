@@ -174,7 +174,7 @@ class Evaluation:
             'graphs': [self._graph(i) for i in range(len(self.experiments))]}
 
     def _graph(self, index: int) -> GraphAcceptance:
-        """Return what came of one task set; the utilisation is the mean of its runs."""
+        """Return the result of one task set; the utilisation is the mean of its runs."""
         experiment = self.experiments[index]
         place = slice(index * self.runs_each, (index + 1) * self.runs_each)
         done = self.done[place]

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes of a run have as their executor: it spins nothing, the loop runs them."""
+"""The executor that the nodes of a run see: it spins nothing, because the loop runs them."""
 
 from __future__ import annotations
 

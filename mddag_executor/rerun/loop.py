@@ -60,7 +60,7 @@ from mddag_executor.simulate.machine import (
 from rclpy.exceptions import InvalidHandle
 
 DRAIN_NS = 10_000_000_000
-"""What has begun may go on this long after the end of the recording, and in a pause of it."""
+"""Work that has begun may continue this long after the end of the recording, and in a pause."""
 POLL_NS = 1_000_000
 """How often a waiting callback polls, or asks again for the interpreter."""
 MOST_POLLS = 1000

@@ -66,7 +66,7 @@ _NO_DISCOVERY = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 @dataclass
 class Result:
     """
-    What came of a rerun.
+    The result of a rerun.
 
     :ivar digest: that of all outputs, see ``outputs``.
     :ivar outputs: what was published, in order.

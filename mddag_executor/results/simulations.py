@@ -119,7 +119,7 @@ class EvaluateResult(TypedDict):
     jobs: int
     """How many processes simulated at a time."""
     graphs: list[GraphAcceptance]
-    """By declaration what came of its runs."""
+    """By declaration, the results of its runs."""
 
 
 class SlackFactor(TypedDict):

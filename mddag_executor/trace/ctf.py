@@ -7,7 +7,7 @@ Theory of operation:
 
 1. The packets of the session are read here, on columns (`ctf_layout`, `ctf_stream`), as the
    metadata of CTF 1.8 or 2 describes them (`tsdl`, `ctf2_metadata`); no other program is needed.
-   What is damaged is read up to the damage, with a warning.
+   A damaged file is read up to the damage, with a warning.
 2. All traces of a session (processes, kernel, rotated chunks) are read as one stream in the order
    of time, and so are several sessions of one host: the metadata has its name, and the UUID of its
    clock, which is that of its boot.  The sessions of several hosts are written one after the

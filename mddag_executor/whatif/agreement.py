@@ -40,11 +40,11 @@ def disagreement(as_recorded: Reschedule) -> str | None:
     if abs(difference) <= POINTS:
         return None
     text = (f'{recorded.recording.run.name}: with the recorded pool the prediction has '
-            f'{_percent(predicted):.1f} % of the results in time, and {_percent(found):.1f} % '
-            'were: predictions from it are that far off or more, for other pools as well')
+            f'{_percent(predicted):.1f} % of the results in time, but {_percent(found):.1f} % '
+            'were: predictions for other pools are off by as much, or more')
     share = _computing(recorded)
     if difference > 0 and share is not None:
-        text += (": other load of the machine and waits for Python's lock are not part of them "
+        text += (": they do not include other load of the machine and waits for Python's lock "
                  f'(callbacks that compute ran on a CPU for {share:.0f} % of their time)')
     return text
 

@@ -3,8 +3,8 @@
 """
 Random driving of the scheduler as the live executor does it, in parallel with a model.
 
-The model remembers every execution that was made ready, under an identity of its own, and what
-became of it; it knows nothing of slots, heaps and keys but what the scheduler's interface shows.
+The model remembers every execution that was made ready, under an identity of its own, and its
+fate; it knows nothing of slots, heaps and keys but what the scheduler's interface shows.
 """
 
 from collections import Counter

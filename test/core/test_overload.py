@@ -120,7 +120,7 @@ def simulated(case, load, horizon, on_late='demote'):
 
 
 def results(case, horizon, holds=False):
-    """Return what came of each sink, and how many of its jobs were in time."""
+    """Return the counts of each sink, and how many of its jobs were in time."""
     load = case.load(horizon)._replace(holds=[1] * len(case.ticks) if holds else [])
     dags = simulated(case, load, horizon).result()['dags']
     sinks = {name: next(iter(dag['sinks'].values())) for name, dag in dags.items()}

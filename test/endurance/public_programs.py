@@ -396,7 +396,7 @@ def missing(program, path):
 
 
 def compare(program, path, seconds, interrupts):
-    """Compare the runs of a program; return what came of it, and whether they differ."""
+    """Compare the runs of a program; return the result, and whether they differ."""
     why = missing(program, path)
     if why:
         return f'skipped: {why}', None

@@ -157,7 +157,7 @@ def test_a_result_that_never_comes_is_a_miss_at_its_deadline(make_executor, make
 
 
 def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path, capfd):
-    """Known at its deadline, to all who ask; what comes of it later is its verdict."""
+    """A miss is known everywhere at its deadline; the later end decides the verdict."""
     misses, reported, go_on = [], [], threading.Event()
     nodes = Declared(make_node, ONCE, {'end': lambda: go_on.wait(60.0)})
     other = make_node('other')

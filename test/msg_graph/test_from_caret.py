@@ -26,7 +26,7 @@ def test_a_file_from_before_humble_is_refused_in_one_line():
 def test_an_architecture_file():
     text = declaration_of(read_architecture((GOLDEN / 'caret.yaml').read_text(), 'arch.yaml'))
     golden.compare('caret', text, GOLDEN)
-    # All blanks at once, with their lines, instead of the errors that come of them.
+    # All blanks at once, with their lines, instead of the errors that follow from them.
     blanks = [n for n, line in enumerate(text.splitlines(), 1) if f'# {MARK}: ' in line]
     with pytest.raises(GraphError) as caught:
         loads(text)

@@ -467,12 +467,11 @@ def verdicts(in_time, late):
 @pytest.mark.parametrize(('predicted', 'recorded', 'text'), [
     ((96, 4), (92, 8), None),
     ((9, 0), (0, 9), None),     # too few
-    ((80, 20), (40, 60), '80.0 % of the results in time, and 40.0 % were: predictions from it are '
-     'that far off or more, for other pools as well: other load of the machine and waits for '
-     "Python's lock are not part of them (callbacks that compute ran on a CPU for 25 % of their "
-     'time)'),
-    ((40, 60), (80, 20), '40.0 % of the results in time, and 80.0 % were: predictions from it are '
-     'that far off or more, for other pools as well')])
+    ((80, 20), (40, 60), '80.0 % of the results in time, but 40.0 % were: predictions for other '
+     'pools are off by as much, or more: they do not include other load of the machine and waits '
+     "for Python's lock (callbacks that compute ran on a CPU for 25 % of their time)"),
+    ((40, 60), (80, 20), '40.0 % of the results in time, but 80.0 % were: predictions for other '
+     'pools are off by as much, or more')])
 def test_a_prediction_is_compared_with_what_the_recorded_pool_did(predicted, recorded, text):
     executions = rows(EXECUTIONS, 3, holds_gil=(True, True, False), cpu=(10, 15, 1),
                       busy=(50, 50, 900))

@@ -245,7 +245,7 @@ before = globals().setdefault('BEFORE', {})
 
 @dataclass
 class Result:
-    """What came of each test of a child: its failures' messages, and after how many seconds."""
+    """The result of each test of a child: its failures' messages, and after how many seconds."""
 
     tests: dict[str, tuple[str, float]]
     output: str
