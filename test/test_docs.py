@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What README and documentation show works, and the documentation builds, offline."""
 
+import ast
 import contextlib
 import importlib
 import inspect
@@ -101,6 +102,21 @@ def test_commands_and_options_exist(page):
         if '--ros-args' in used:
             used.discard('-r')
         assert used - known_options(words) - {'--help'} == set(), line
+
+
+OF_OTHERS = {'--dual-session', '--part', '--show-args', '--use-sim-time', '--version'}
+
+
+def test_messages_name_options_that_exist():
+    """A message that advises a removed option sends its reader in a circle."""
+    known = {option for verb in program.VERBS for option in known_options(verb.split())}
+    for package in ('mddag_executor', 'msg_graph'):
+        for path in (TOP / package).rglob('*.py'):
+            for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+                text = node.value if isinstance(node, ast.Constant) else None
+                if isinstance(text, str) and ' ' in text.strip():
+                    named = re.findall(r'(?<![\w-])--[a-z][a-z-]*', text)
+                    assert {*named} <= known | OF_OTHERS, f'{path}:{node.lineno}: {text}'
 
 
 def test_the_page_of_commands_has_the_groups_of_the_help():

@@ -87,7 +87,7 @@ class Draws:
     def __init__(self, task_set: TaskSet, seed: int, samples: Samples | None = None) -> None:
         self._seed = seed
         if samples is None:
-            check_execution_times(task_set, ', or give --samples FILE.npz')
+            check_execution_times(task_set, ', or give --execution-times FILE.npz')
         self._pickers: list[Callable[[Floats], Times]] = [
             partial(_from_table, vertex.callback.execution_time)  # type: ignore[arg-type]
             if samples is None else partial(_from_measured, samples[vertex.callback.key])

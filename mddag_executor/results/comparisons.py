@@ -19,7 +19,7 @@ class VerdictCounts(TypedDict):
     late: int
     """Results completed after it, and overdue ones."""
     expired: int
-    """Results whose job was given up."""
+    """Results whose job expired, because it could no longer complete."""
     aborted: int
     """Results whose job was aborted (only in recordings of version 2.0 and before)."""
     failed: int
@@ -225,7 +225,7 @@ class TopSink(TypedDict):
     wrong: str
     """What is wrong, in words; empty: nothing."""
     window_results: float | None
-    """Number of results in the last period of diagnostics."""
+    """Number of results that were due in the window (the last 10 periods of the diagnostics)."""
     in_time_ratio: float | None
     """Share of these that were in time."""
     response_p99_ms: float | None

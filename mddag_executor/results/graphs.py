@@ -91,7 +91,7 @@ class CheckResult(CheckResultRare):
     utilisation: float | None
     """The load divided by the workers; null if an execution time is not declared."""
     budget: str
-    """What of each execution time the tests count: `max`, `p99` or `mean`."""
+    """Which value of each execution time the tests use: `max`, `p99` or `mean`."""
     tests: list[NecessaryTest]
     """The necessary tests; empty if an execution time is not declared."""
     queue_edges: list[CheckedQueueEdge]
@@ -137,7 +137,7 @@ class AssignResult(AssignResultRare):
     policy: str
     """The policy that the acceptance was measured with."""
     budget: str
-    """What of each execution time counts: `max`, `p99` or `mean`."""
+    """Which value of each execution time is used: `max`, `p99` or `mean`."""
     deadlines_ns: dict[str, int]
     """By sink's callback the assigned deadline."""
     acceptance: MeasuredAcceptance

@@ -111,7 +111,7 @@ class EvaluateResult(TypedDict):
     judge: str
     """How jobs that are open at the end are judged: `horizon` or `completions`."""
     samples: bool
-    """Whether measured execution times were drawn (`--samples`)."""
+    """Whether measured execution times were drawn (`--execution-times`)."""
     interrupted: bool
     """Whether it was interrupted before all runs were done."""
     compiled: bool

@@ -70,7 +70,7 @@ class SinkVerdicts(SinkVerdictsRare):
     overdue: int
     """Results that were still open, and past their deadline, when the run ended."""
     expired: int
-    """Results that never completed, because their job was given up."""
+    """Results that never completed, because their job expired."""
     failed: int
     """Results that never completed, because a callback of their job raised an exception."""
     dropped: int
@@ -111,9 +111,9 @@ class JobEnds(JobEndsRare):
     completed: int
     """All sinks completed in time."""
     late: int
-    """A sink missed its deadline, and the job was not given up."""
+    """A sink missed its deadline, and the job did not expire."""
     expired: int
-    """The job was given up after its deadlines."""
+    """The job expired, because it could no longer complete."""
     failed: int
     """A callback of the job raised an exception."""
     dropped: int
