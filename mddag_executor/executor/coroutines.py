@@ -32,7 +32,7 @@ from mddag_executor.executor.asyncio_loop import (
     stepping,
 )
 from mddag_executor.executor.compat import awaited, NEXT_TURN, QuickCallback
-from mddag_executor.executor.interrupts import interruptible
+from mddag_executor.executor.interrupts import runs_callbacks
 
 
 class Loops:
@@ -178,7 +178,7 @@ class Steps:
             asyncio._set_running_loop(before)
             stepping.steps = outer
 
-    @interruptible
+    @runs_callbacks
     def _continue(self) -> Any:
         """Continue the coroutine until it yields."""
         if self._must_cancel:

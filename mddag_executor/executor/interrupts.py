@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A SIGINT raises KeyboardInterrupt where a spin has nothing in hand.
+What the handler of a signal raises comes out of a spin where that has nothing in hand.
 
 Theory of operation
 -------------------
@@ -10,22 +10,27 @@ Theory of operation
     has in hand: an event that the kernel reports once, a message that was just taken, or an
     execution that the core has just dispatched.  A program that catches KeyboardInterrupt and
     spins again would wait for it for ever.
-2.  So SIGINT has the handler of this module while the main thread spins.  It calls the handler
-    that it has replaced at once if the thread waits for events or runs a callback (the functions
-    marked with ``interruptible``).  Otherwise it *defers* the call until the spin waits, or ends.
+2.  So the handler of this module replaces those of Python functions while the main thread spins.
+    It calls the replaced handler at once if the thread waits for events (in a function marked with
+    ``interruptible``) or runs a callback (called by a function marked with ``runs_callbacks``).
+    Otherwise it *defers* the call until the spin waits, or ends.
 3.  A second SIGINT is not deferred: the first may have come to a callback that never ends, while
-    the callback called the executor.
-4.  If rclpy itself handles SIGINT, nothing is replaced: its handler is written in C, and ends the
-    context, so the program cannot spin again.
+    the callback called the executor.  For this case, other signals are repeated every ``REPEAT_S``
+    as long as they are deferred, and called as soon as one of them comes to a callback.
+4.  If rclpy itself handles a signal, nothing is replaced: its handler is written in C, and ends
+    the context, so the program cannot spin again.
 """
 
 from __future__ import annotations
 
+import _thread
 from collections.abc import Callable
+from importlib import import_module
 import select
 import signal
 import sys
 import threading
+import time
 from types import CodeType, FrameType
 from typing import Any, TypeVar
 
@@ -34,82 +39,157 @@ from rclpy.signals import get_current_signal_handlers_options, SignalHandlerOpti
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = __name__.partition('.')[0]
 _MOST_FD_OF_SELECT = 1023
-_OF_RCLPY = (SignalHandlerOptions.ALL, SignalHandlerOptions.SIGINT)
+_OF_RCLPY = {
+    signal.SIGINT: (SignalHandlerOptions.ALL, SignalHandlerOptions.SIGINT),
+    signal.SIGTERM: (SignalHandlerOptions.ALL, SignalHandlerOptions.SIGTERM)}
+_FAULTS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
+_NUMBERS = tuple(
+    number for number in sorted(signal.valid_signals())
+    if number < signal.SIGRTMIN and number not in _FAULTS)
+# Without the conversion of ``signal`` to enumerations: this runs in each ``spin_once``.
+_signal: Any = import_module('_signal')
+REPEAT_S = 0.05
+"""How often a signal is repeated whose handler is deferred."""
 
 _interruptible: set[CodeType] = set()
+_runs_callbacks: set[CodeType] = set()
 
 
 def interruptible(function: _Function) -> _Function:
-    """Mark a function that waits or runs code of the program, and has nothing in hand."""
+    """Mark a function that waits, and has nothing in hand."""
     _interruptible.add(function.__code__)
+    return function
+
+
+def runs_callbacks(function: _Function) -> _Function:
+    """Mark a function that calls code of the program; before that, it has something in hand."""
+    _runs_callbacks.add(function.__code__)
     return function
 
 
 class _Deferred:
     """
-    The handler of SIGINT in a spin of the main thread.
+    The handler of signals in a spin of the main thread.
 
-    :ivar original: the handler that it replaces.
-    :ivar is_pending: whether a call of that is deferred.
+    :ivar originals: the handlers that it replaces, by signal.
+    :ivar pending: the signals whose handlers are still to be called, in their order.
     """
 
     def __init__(self) -> None:
-        self.original: Any = None
-        self.is_pending = False
+        self.originals: dict[int, Any] = {}
+        self.pending: dict[int, None] = {}
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Call the original handler, or defer that."""
-        if self.is_pending or _may_interrupt(frame):
-            self.is_pending = False
-            self.original(number, frame)
-        else:
-            self.is_pending = True
+        is_second = number in self.pending
+        if _may_interrupt(frame) or is_second and (
+                number == signal.SIGINT or _is_in_callback(frame)):
+            self.pending.pop(number, None)
+            self.originals[number](number, frame)
+        elif not is_second:
+            self.pending[number] = None
+            if number != signal.SIGINT:
+                # not a ``Thread``: the signal may have interrupted one that starts, with its lock
+                _thread.start_new_thread(self._repeat, (number,))
+
+    def _repeat(self, number: int) -> None:
+        time.sleep(REPEAT_S)
+        while number in self.pending:
+            signal.pthread_kill(threading.main_thread().ident or 0, number)
+            time.sleep(REPEAT_S)
 
     def call_pending(self) -> None:
-        """Call the original handler now, if that was deferred."""
-        if self.is_pending:
-            self.is_pending = False
-            self.original(signal.SIGINT, sys._getframe())
+        """Call the original handlers now whose calls were deferred."""
+        if self.pending:
+            number = next(iter(self.pending))
+            del self.pending[number]
+            try:
+                self.originals[number](number, sys._getframe())
+            finally:
+                self.call_pending()
 
 
 def _may_interrupt(frame: FrameType | None) -> bool:
-    """Return whether the innermost function of this package is marked as interruptible."""
-    while frame is not None:
-        if frame.f_code in _interruptible:
-            return True
-        if str(frame.f_globals.get('__name__')).partition('.')[0] == _PACKAGE:
-            return False
+    """Return whether a thread waits, or runs code that is not of this package."""
+    if frame is None or frame.f_code in _interruptible:
+        return True
+    while frame is not None and not _is_of_package(frame):
         frame = frame.f_back
-    return True
+        if frame is not None and frame.f_code in _runs_callbacks:
+            return True
+    return frame is None
+
+
+def _is_of_package(frame: FrameType) -> bool:
+    return str(frame.f_globals.get('__name__')).partition('.')[0] == _PACKAGE
+
+
+def _is_in_callback(frame: FrameType | None) -> bool:
+    """Return whether a thread runs a callback, perhaps in a call of this package."""
+    while frame is not None and frame.f_code not in _runs_callbacks:
+        frame = frame.f_back
+    return frame is not None
 
 
 _deferred = _Deferred()  # Python handles signals in one thread only
 
 
-class InterruptsDeferred:
-    """Defer interrupts of the calling thread while entered, if it is the main thread."""
+def handler_of(number: int) -> Any:
+    """Return the handler of a signal; in a spin the one that has been replaced."""
+    handler = signal.getsignal(number)
+    return _deferred.originals[number] if handler == _deferred.handle else handler
 
-    __slots__ = ('_replaces',)
+
+class InterruptsDeferred:
+    """Defer what interrupts the calling thread while entered, if it is the main thread."""
+
+    __slots__ = ('_replaced',)
 
     def __enter__(self) -> None:
-        """Replace the handler of SIGINT, unless a spin that calls this one has."""
-        self._replaces = False
+        """Replace the handlers of signals, unless a spin that calls this one has."""
+        self._replaced: list[int] = []
         if threading.current_thread() is not threading.main_thread():
             return
-        original = signal.getsignal(signal.SIGINT)
-        if callable(original) and original != _deferred.handle and (
-                get_current_signal_handlers_options() not in _OF_RCLPY):
-            _deferred.original, _deferred.is_pending = original, False
-            signal.signal(signal.SIGINT, _deferred.handle)
-            self._replaces = True
+        try:
+            for number, handler in zip(_NUMBERS, map(_signal.getsignal, _NUMBERS)):
+                if callable(handler) and _is_to_be_deferred(number, handler):
+                    _deferred.originals[number] = handler
+                    self._replaced.append(number)
+                    _signal.signal(number, _deferred.handle)
+        except BaseException:  # of a handler that is not yet replaced
+            self.__exit__()
+            raise
 
     def __exit__(self, *args: object) -> None:
-        """Restore the handler, and call it if that was deferred."""
+        """Restore the handlers, and call those that were deferred."""
         if threading.current_thread() is not threading.main_thread():
             return
-        if self._replaces and signal.getsignal(signal.SIGINT) == _deferred.handle:
-            signal.signal(signal.SIGINT, _deferred.original)
+        for number in self._replaced:
+            if _signal.getsignal(number) == _deferred.handle:
+                _signal.signal(number, _deferred.originals[number])
+        if _deferred.pending:
+            _deferred.call_pending()
+
+
+def _is_to_be_deferred(number: int, handler: Any) -> bool:
+    return handler != _deferred.handle and (
+        number not in _OF_RCLPY or get_current_signal_handlers_options() not in _OF_RCLPY[number]
+    ) and (number == signal.SIGINT  # asyncio's does nothing but to wake its loop
+           or getattr(handler, '__module__', None) != 'asyncio.unix_events')
+
+
+@interruptible
+def wait_for_permit(lock: threading.Lock, seconds: float | None) -> bool:
+    """Acquire a lock that another thread releases; return whether that was in time."""
+    if threading.current_thread() is threading.main_thread():
         _deferred.call_pending()
+    return lock.acquire(timeout=-1 if seconds is None else seconds)
+
+
+@interruptible
+def interruptible_sleep(seconds: float) -> None:
+    """Sleep; an interrupt ends that."""
+    time.sleep(seconds)
 
 
 @interruptible

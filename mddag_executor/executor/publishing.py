@@ -36,7 +36,7 @@ from typing import Any
 
 from mddag_executor.executor.attribution import NO_ORIGIN, Publication, PublisherState
 from mddag_executor.executor.compat import GUARD_HANDLE
-from mddag_executor.executor.interrupts import interruptible
+from mddag_executor.executor.interrupts import runs_callbacks
 from mddag_executor.executor.listeners import announce_trigger
 from mddag_executor.executor.work import current, Runner
 from rclpy.client import Client
@@ -213,7 +213,7 @@ def install() -> None:
             for delivery in deliveries:
                 delivery.collect_published(publication, running)
 
-    @interruptible
+    @runs_callbacks
     def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:
         running = current.running
         if running is None:

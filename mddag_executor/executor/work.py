@@ -29,7 +29,7 @@ from typing import Any, Protocol
 from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.compat import cancel_running
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.interrupts import interruptible
+from mddag_executor.executor.interrupts import runs_callbacks
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 
@@ -124,7 +124,7 @@ class Work:
         self.args = args
         self.then = then
 
-    @interruptible
+    @runs_callbacks
     def run(self, must_check: bool = True) -> Any:
         """
         Run, or continue; return None when it has finished, else what it waits for.
@@ -175,7 +175,7 @@ def _nothing() -> None:
 class TaskWork(Work):
     """An execution of an rclpy ``Task``; exceptions are the task's."""
 
-    @interruptible
+    @runs_callbacks
     def run(self, must_check: bool = True) -> Any:
         """Run the task once; return None when it is done."""
         task: Any = self.function

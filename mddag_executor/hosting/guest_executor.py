@@ -25,8 +25,10 @@ import time
 from typing import Any, Protocol
 
 from mddag_executor.executor.compat import is_called_by_spin
+from mddag_executor.executor.interrupts import interruptible_sleep, InterruptsDeferred
 from mddag_executor.executor.outer_groups import outer_here
 from mddag_executor.executor.tasks import watched
+from mddag_executor.hosting.change import Change
 from mddag_executor.hosting.guest import Guest
 from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor
 from rclpy.logging import get_logger
@@ -54,7 +56,7 @@ class HostOfExecutors(Protocol):
         """Return whether the run or the program has ended."""
 
     def wait(
-        self, changed: threading.Condition, until: Callable[[], bool], timeout_s: float | None,
+        self, changed: Change, until: Callable[[], bool], timeout_s: float | None,
         guest: Guest | None,
     ) -> None:
         """Wait until a condition is true, the run or the program ends, or the timeout is over."""
@@ -101,7 +103,8 @@ class GuestExecutor:
     host: HostOfExecutors
     guest: Guest | None
     is_global = False
-    _changed: threading.Condition
+    _changed: Change
+    _lock: threading.Lock
     _errors: deque[BaseException]
     has_spun = is_pool = False
     _is_stopped = False
@@ -140,7 +143,7 @@ class GuestExecutor:
             timeout_sec = _STEP_S
         if self.guest is not None and self.host.is_over(self.guest):
             raise ExternalShutdownException()
-        with self._changed:
+        with self._lock:
             self._n_stepping += 1
         # callbacks that are in no group also run between two spins
         groups = self._groups()
@@ -155,10 +158,28 @@ class GuestExecutor:
         try:
             self._wait(lambda: has_ended() or until(), timeout_sec, is_step=True)
         finally:
-            with self._changed:
+            with self._lock:
                 self._n_stepping -= 1
 
     def _wait(self, until: Callable[[], bool], timeout_sec: Any, is_step: bool = False) -> None:
+        error: BaseException | None = None
+        try:
+            with InterruptsDeferred():
+                error = self._let_run(until, timeout_sec, is_step)
+        except KeyboardInterrupt as interrupt:
+            self.host.note_interrupt()
+            if error is not None:  # the next spin raises it
+                self._errors.appendleft(error)
+            error = interrupt
+        if isinstance(error, KeyboardInterrupt):
+            self._await_callbacks()
+        if error is not None:
+            raise error
+
+    def _let_run(
+        self, until: Callable[[], bool], timeout_sec: Any, is_step: bool
+    ) -> BaseException | None:
+        """Let the nodes run until a condition is true; return what a callback has raised."""
         self.has_spun = True
         self._adopt(Executor.get_nodes(self))  # type: ignore[arg-type]
         raised: list[BaseException] = []
@@ -174,28 +195,24 @@ class GuestExecutor:
         timeout_s = getattr(timeout_sec, 'timeout', timeout_sec)
         if timeout_s is not None:
             timeout_s = min(timeout_s, threading.TIMEOUT_MAX)
-        with self._changed:
+        with self._lock:
             self._n_spinning += 1
         # a callback that spins is in one of the groups: the host lets others of that run
         groups = [group for group in self._groups() if group.number != outer_here()]
+        is_interrupted = True
         try:
             may_start = self._open(groups, is_step)
             if may_start and timeout_s is not None and 0 <= timeout_s < _START_S:
                 timeout_s = _START_S
             self.host.wait(self._changed, is_over, timeout_s, self.guest)
-        except KeyboardInterrupt as error:
-            self.host.note_interrupt()
-            raised = [error]
+            is_interrupted = False
         finally:
-            with self._changed:
+            with self._lock:
                 self._n_spinning -= 1
             if not self._n_spinning:
-                self._close(groups)
+                self._close(groups, is_interrupted)
             self._n_seen = self._n_ended
-        if raised:
-            if isinstance(raised[0], KeyboardInterrupt):
-                self._await_callbacks()
-            raise raised[0]
+        return raised[0] if raised else None
 
     def _groups(self) -> list[Any]:
         """Return the outer groups that a spin opens."""
@@ -216,19 +233,19 @@ class GuestExecutor:
             may_start |= group.open(limit, is_step and limit == 1)
         return is_step and may_start
 
-    def _close(self, groups: list[Any]) -> None:
-        """Let no more callbacks run; in a single thread, the running one would end before."""
+    def _close(self, groups: list[Any], is_interrupted: bool) -> None:
+        """
+        Let no more callbacks run; in a single thread, the running one would end before.
+
+        :param is_interrupted: a signal ends the spin, so the next one ends this.
+        """
         is_single = _limit(self) == 1
-        try:
-            for group in groups:
-                group.open(0)
-        except KeyboardInterrupt:
-            for group in groups:
-                group.open(0)
-            raise
+        for group in groups:
+            group.open(0)
+        pause = interruptible_sleep if is_interrupted else time.sleep
         for group in groups:
             while is_single and group.n_running() and not self.host.is_over(self.guest):
-                time.sleep(_POLL_S)
+                pause(_POLL_S)
         self.host.note_waiting(groups)
 
     def _await_callbacks(self) -> None:
@@ -250,8 +267,7 @@ class GuestExecutor:
 
     def wake_waiting(self) -> None:
         """Let waiting threads check their conditions again."""
-        with self._changed:
-            self._changed.notify_all()
+        self._changed.notify()
 
     def callback_ended(self, error: BaseException | None) -> bool:
         """Note that a callback has ended; return whether a spin raises its error."""
@@ -261,13 +277,12 @@ class GuestExecutor:
                 self.wake_waiting()
             return False
         guest = self.guest
-        with self._changed:
-            if guest is None or guest.returned or self.host.is_over(guest) or (
-                    len(self._errors) >= _MOST_ERRORS):
-                return False
-            self._errors.append(error)
-            self._changed.notify_all()
-            return True
+        if guest is None or guest.returned or self.host.is_over(guest) or (
+                len(self._errors) >= _MOST_ERRORS):
+            return False
+        self._errors.append(error)
+        self.wake_waiting()
+        return True
 
     def add_node(self, node: Node) -> bool:
         """Add a node; once this executor has spun, it runs at once."""
@@ -325,7 +340,7 @@ def make_guest(executor: Any, host: HostOfExecutors, guest: Guest | None) -> Non
     """Make a ``GuestExecutor`` of an executor."""
     executor.__class__ = _guest_class(executor.__class__)
     executor.host, executor.guest = host, guest
-    executor._changed, executor._errors = threading.Condition(), deque()
+    executor._changed, executor._lock, executor._errors = Change(), threading.Lock(), deque()
 
 
 def _is_replaced(kind: type[Executor], name: str) -> bool:

@@ -61,8 +61,10 @@ from typing import Any, NoReturn, TypeVar
 import weakref
 
 from mddag_executor.executor.compat import alive, executor_kept
+from mddag_executor.executor.interrupts import handler_of
 from mddag_executor.executor.registry import snapshot
 from mddag_executor.executor.work import current
+from mddag_executor.hosting.change import Change
 from mddag_executor.hosting.guest import Guest
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
@@ -506,7 +508,7 @@ class Host:
     # --- waiting ---------------------------------------------------------------------------------
 
     def wait(
-        self, changed: threading.Condition, until: Callable[[], bool], timeout_s: float | None,
+        self, changed: Change, until: Callable[[], bool], timeout_s: float | None,
         guest: Guest | None,
     ) -> None:
         """
@@ -517,7 +519,7 @@ class Host:
         :param changed: is notified when ``until`` may have become true.
         """
         is_callback = self.current_guest() is None
-        with self._lend(), changed:
+        with self._lend():
             changed.wait_for(
                 lambda: until() or self.is_over(guest) or is_callback and self._is_ending(),
                 None if timeout_s is None or timeout_s < 0 else timeout_s)
@@ -553,7 +555,7 @@ class Host:
         for guest in running:
             if self._has_main(guest):  # unless the program has replaced the handler meanwhile
                 ends |= number in guest.signals and (
-                    guest.signals[number] == signal.getsignal(number))
+                    guest.signals[number] == handler_of(number))
             elif number == signal.SIGINT:
                 guest.interrupted = True
                 ends |= number in guest.signals
@@ -580,7 +582,7 @@ class Host:
         guest = self.current_guest()
         if guest is not None:
             for number in _SIGNALS_OF.get(options, ()):
-                guest.signals[number] = signal.getsignal(number)
+                guest.signals[number] = handler_of(number)
 
     def _uninstall_signal_handlers(self) -> None:
         guest = self.current_guest()

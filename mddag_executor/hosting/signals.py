@@ -28,6 +28,8 @@ import time
 from types import FrameType
 from typing import Any, Protocol
 
+from mddag_executor.executor.interrupts import handler_of
+
 SAME_SIGNAL_S = 1.0
 """Signals within this time are one: `timeout` sends one to the process, and one to its group."""
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -179,7 +181,7 @@ class Signals:
                         continue
                     # others have their handlers, which do it
                     if number == signal.SIGINT or number in self._before and (
-                            signal.getsignal(number) != self._handle):
+                            handler_of(number) != self._handle):
                         self.received(number)
                 if 0 in numbers:
                     return True
@@ -202,7 +204,7 @@ class Signals:
     def interrupt(self) -> None:
         """Raise KeyboardInterrupt in the program in the main thread, if Python's handler does."""
         if self._pipe is not None and (
-                signal.getsignal(signal.SIGINT) is signal.default_int_handler):
+                handler_of(signal.SIGINT) is signal.default_int_handler):
             with self._lock:
                 self._n_own += 1
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)

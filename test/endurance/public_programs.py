@@ -11,15 +11,16 @@ already (``make test-public`` adds ``SOURCES/install``); a program whose imports
 missing is skipped with a line that says so.
 
 Each program runs with the same inputs under its own executor, and as ``mddag run --node`` hosts
-it.  First one run of each: a node of this script publishes the inputs, calls the services, and
-counts messages and responses for some seconds, starting with the first one.  The two runs are the
+it.  First one run of each: a node of this script publishes the inputs, calls the services, sends
+goals to the actions, serves what the program is a client of, and counts messages, responses,
+results, requests and goals for some seconds, starting with the first one.  The two runs are the
 same if
 
 * the same topics were published on, with the same types;
-* each topic had as many messages, and each service as many responses, give or take a quarter (a
-  slow machine counts as equal);
-* the last message of the topics in ``Program.constant`` and the last response of each service
-  were the same;
+* each topic had as many messages, each service as many responses and each action as many results,
+  give or take a quarter (a slow machine counts as equal);
+* the last message of the topics in ``Program.constant``, the last response of each service, and
+  the last status and result of each action were the same;
 * both ran until SIGINT, or neither.
 
 Then come runs that SIGINT ends at random moments, from the first line of the program on; most
@@ -46,9 +47,11 @@ from typing import Any, NamedTuple
 
 from geometry_msgs.msg import Twist, Vector3
 import rclpy
+from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
+from rclpy.task import Future
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
@@ -84,7 +87,10 @@ class Program(NamedTuple):
     inputs: tuple[tuple[str, Any], ...] = ()  # messages by topic, published at 20 Hz
     constant: tuple[str, ...] = ()  # the topics whose last message must be the same
     parameters: tuple[str, ...] = ()  # ROS parameters, ``name:=value``
-    calls: tuple[tuple[str, str, dict[str, Any]], ...] = ()  # service, type, request; at 5 Hz
+    # service, type, request, at 5 Hz; or action, type, goal, one goal after the other
+    calls: tuple[tuple[str, str, dict[str, Any]], ...] = ()
+    # the program is a client of these services and actions: name, type, response or result
+    serves: tuple[tuple[str, str, dict[str, Any]], ...] = ()
 
 
 _EXAMPLES = 'examples/rclpy'
@@ -95,6 +101,9 @@ _ROSBRIDGE = ('rosbridge_suite/rosbridge_library/src', 'rosbridge_suite/rosbridg
 _FLEXBE = tuple(f'flexbe_behavior_engine/flexbe_{each}' for each in (
     'core', 'mirror', 'onboard', 'widget', 'input'))
 _SUM = (('/add_two_ints', 'example_interfaces/srv/AddTwoInts', {'a': 2, 'b': 3}),)
+_IS_SUM = (('/add_two_ints', 'example_interfaces/srv/AddTwoInts', {'sum': 42}),)
+_FIBONACCI = (('/fibonacci', 'example_interfaces/action/Fibonacci', {'order': 3}),)
+_IS_FIBONACCI = (('/fibonacci', 'example_interfaces/action/Fibonacci', {'sequence': [0, 1, 1]}),)
 
 
 def _examples(*names):
@@ -107,7 +116,10 @@ def _examples(*names):
             (f'{_EXAMPLES}/{folder}/{package}' if folder else f'{_EXAMPLES}/{package}',),
             (('/topic', String(data='Hello')), ('/chatter', String(data='Hello'))) * (
                 module in ('listener', 'custom_executor') or 'subscriber' in module),
-            calls=_SUM * ('minimal_service' in name)))
+            calls=(_SUM * (package == 'minimal_service')
+                   + _FIBONACCI * (package == 'minimal_action_server')),
+            serves=(_IS_SUM * (package == 'minimal_client')
+                    + _IS_FIBONACCI * (package == 'minimal_action_client'))))
     return made
 
 
@@ -132,11 +144,19 @@ PROGRAMS = (
         'topics/minimal_subscriber/subscriber_lambda',
         'topics/minimal_subscriber/subscriber_old_school',
         'services/minimal_service/service', 'services/minimal_service/service_member_function',
+        'services/minimal_client/client', 'services/minimal_client/client_async',
+        'services/minimal_client/client_async_callback',
+        'services/minimal_client/client_async_member_function',
         '/executors/callback_group', '/executors/composed', '/executors/custom_callback_group',
         '/executors/custom_executor', '/executors/listener', '/executors/talker',
         '/guard_conditions/trigger_guard_condition',
         'actions/minimal_action_server/server',
-        'actions/minimal_action_server/server_queue_goals'),
+        'actions/minimal_action_server/server_defer',
+        'actions/minimal_action_server/server_single_goal',
+        'actions/minimal_action_server/server_queue_goals',
+        'actions/minimal_action_client/client', 'actions/minimal_action_client/client_asyncio',
+        'actions/minimal_action_client/client_cancel',
+        'actions/minimal_action_client/client_not_composable'),
     Program('dynamic_broadcaster', 'examples_tf2_py.dynamic_broadcaster:main', (
         'geometry2/examples_tf2_py', 'geometry2/tf2_ros_py', 'geometry2/tf2_py')),
     Program('joy_teleop', 'joy_teleop.joy_teleop:main', ('teleop_tools/joy_teleop',)),
@@ -196,14 +216,74 @@ class Probe:
             self.node.create_timer(0.05, lambda p=publisher, m=message: p.publish(m))
         for name, type_name, fields in program.calls:
             kind = _interface(type_name)
+            if '/action/' in type_name:
+                self._send_goals(name, ActionClient(self.node, kind, name), kind.Goal(**fields))
+                continue
             client, request = self.node.create_client(kind, name), kind.Request(**fields)
             self.node.create_timer(
                 0.2, lambda n=name, c=client, r=request: self._call(n, c, r))
+        for name, type_name, fields in program.serves:
+            kind = _interface(type_name)
+            if '/action/' in type_name:
+                self._serve_goals(name, kind, kind.Result(**fields))
+            else:
+                self._serve(name, kind, kind.Response(**fields))
         self.node.create_timer(0.1, self._look)
+
+    def _send_goals(self, name, client, goal):
+        running = []
+
+        def send():
+            if not running and client.server_is_ready():
+                running.append(client.send_goal_async(goal, lambda message: self._count(
+                    f'{name} feedback', None)))
+                running[0].add_done_callback(sent)
+
+        def sent(future):
+            handle = future.result()
+            if handle.accepted:
+                handle.get_result_async().add_done_callback(ended)
+            else:
+                running.clear()
+                self._count(name, 'rejected')
+
+        def ended(future):
+            running.clear()
+            self._count(name, (future.result().status, future.result().result))
+
+        self.node.create_timer(0.1, send)
+
+    def _serve(self, name, kind, response):
+        def serve(request, _):
+            self._count(name, request)
+            return response
+
+        self.node.create_service(kind, name, serve)
+
+    def _serve_goals(self, name, kind, result):
+        async def serve(handle):
+            self._count(name, handle.request)
+            for _ in range(5):
+                handle.publish_feedback(kind.Feedback())
+                if handle.is_cancel_requested:
+                    handle.canceled()
+                    return result
+                await self._sleep(0.2)
+            handle.succeed()
+            return result
+
+        ActionServer(self.node, kind, name, serve,
+                     cancel_callback=lambda _: CancelResponse.ACCEPT)
+
+    async def _sleep(self, seconds):
+        future = Future()
+        timer = self.node.create_timer(seconds, lambda: future.set_result(None))
+        await future
+        self.node.destroy_timer(timer)
 
     def _look(self):
         for topic, types in self.node.get_topic_names_and_types():
-            if topic in self.types or topic in self._ignored or not (
+            if topic in self.types or topic in self._ignored or '/_action/' in topic or not (
                     self.node.get_publishers_info_by_topic(topic)):
                 continue
             self.types[topic] = types[0]
@@ -315,7 +395,7 @@ def observe(place, hosted, seconds):
             process.kill()
             probe.close()
             rclpy.shutdown()
-    names = (*program.constant, *(name for name, *_ in program.calls))
+    names = (*program.constant, *(name for name, *_ in (*program.calls, *program.serves)))
     constant = {name: probe.last.get(name) for name in names}
     return Run(probe.types, probe.counts, constant, end, _status(process), _lines(said))
 

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+import types
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor import workers
@@ -363,21 +364,25 @@ def test_no_interrupt_gets_lost_where_something_of_a_context_dies(ros_context, m
 
 
 class Injector:
-    """Sends SIGINT to this thread at the n-th line that it runs in the package."""
+    """Sends a signal to this thread at the n-th line that it runs in the package."""
 
-    def __init__(self):
+    def __init__(self, number=signal.SIGINT):
+        self.number = number
         self.left = 0
+        # the interrupted function is that of the package, and not the one below
+        self._in_package = types.FunctionType(
+            Injector._at_line.__code__, {**globals(), '__name__': 'mddag_executor'}).__get__(self)
 
     def _of_frame(self, frame, event, arg):
-        return self._at_line if '/mddag_executor/' in frame.f_code.co_filename else None
+        return self._in_package if '/mddag_executor/' in frame.f_code.co_filename else None
 
     def _at_line(self, frame, event, arg):
         if event == 'line':
             self.left -= 1
             if self.left == 0:
                 sys.settrace(None)
-                signal.raise_signal(signal.SIGINT)
-        return self._at_line
+                signal.raise_signal(self.number)
+        return self._in_package
 
     def interrupts(self, function, n):
         """Call a function; return whether KeyboardInterrupt came out of it."""
@@ -392,16 +397,21 @@ class Injector:
         return False
 
 
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGALRM])
 @pytest.mark.parametrize('steps', [True, False])
-def test_an_interrupt_at_any_line_of_a_spin_loses_nothing(make_executor, make_node, steps):
-    """A program that catches KeyboardInterrupt and spins again goes on as if none had come."""
+def test_an_interrupt_at_any_line_of_a_spin_loses_nothing(
+        make_executor, make_node, request, steps, number):
+    """A program that catches what a handler raises, and spins again, goes on as if none came."""
+    before = signal.signal(number, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(number, before))
     node, fired, received = make_node(), [], []
     node.create_timer(0.001, lambda: fired.append(1))
     node.create_subscription(Header, '/topic', lambda msg: received.append(msg.frame_id), 10)
     node.create_service(Trigger, '/ask', lambda request, response: response)
     publisher, client = node.create_publisher(Header, '/topic', 10), node.create_client(
         Trigger, '/ask')
-    executor, injector, interrupts = make_executor(num_workers=2, nodes=[node]), Injector(), 0
+    executor, injector = make_executor(num_workers=2, nodes=[node]), Injector(number)
+    interrupts = 0
 
     def turn():
         if steps:
@@ -420,9 +430,9 @@ def test_an_interrupt_at_any_line_of_a_spin_loses_nothing(make_executor, make_no
         publisher.publish(Header(frame_id=str(n)))
         answer, task = client.call_async(Trigger.Request()), executor.create_task(bool)
         interrupts += injector.interrupts(lambda: [turn(), turn(), turn()], n)
-        before = len(fired)
+        seen = len(fired)
         assert until(lambda: str(n) in received and answer.done() and task.done()), n  # noqa: B023
-        assert until(lambda: len(fired) > before), n  # noqa: B023
+        assert until(lambda: len(fired) > seen), n  # noqa: B023
     assert interrupts > 20
 
 
