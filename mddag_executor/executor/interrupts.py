@@ -39,7 +39,7 @@ from rclpy.signals import get_current_signal_handlers_options, SignalHandlerOpti
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = __name__.partition('.')[0]
 _MOST_FD_OF_SELECT = 1023
-_OF_RCLPY = {
+_OF_RCLPY: dict[int, tuple[Any, ...]] = {
     signal.SIGINT: (SignalHandlerOptions.ALL, SignalHandlerOptions.SIGINT),
     signal.SIGTERM: (SignalHandlerOptions.ALL, SignalHandlerOptions.SIGTERM)}
 _FAULTS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
