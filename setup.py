@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 from setuptools import find_packages, setup
 
 NAME = 'mddag_executor'
-BATCH = ['matplotlib>=3.6', 'numba>=0.59']
+BATCH = ['llvmlite>=0.42', 'matplotlib>=3.6']
 DASK = ['distributed>=2023.5']
 DOCS = [
     'mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26',

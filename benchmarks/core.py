@@ -3,7 +3,7 @@
 """
 The benchmark `core`: CPU time of the scheduler core in plain Python, under each policy.
 
-The core adds this to each callback in a live run; it is also the time of simulation without numba.
+The core adds this to each callback in a live run; it is also that of simulation without llvmlite.
 Figures depend on the machine and its other load: all are medians.
 """
 

@@ -163,9 +163,6 @@ ROS = (
     'cli/test_run.py', 'cli/test_demo.py', 'cli/test_top.py', 'cli/test_graph.py',
     'test_docs.py')
 
-# One process compiles the core, which takes half a minute the first time.
-COMPILE = ('simulate/test_compiled.py', 'laboratory/test_evaluate.py')
-
 
 def pytest_collection_modifyitems(items):
     if 'PYTEST_XDIST_WORKER' in os.environ:
@@ -181,8 +178,6 @@ def pytest_xdist_make_scheduler(config, log):
     class Scheduling(LoadScopeScheduling):
 
         def _split_scope(self, nodeid):
-            if _is_in(nodeid, COMPILE):
-                return 'compile'
             return nodeid.partition('::')[0] if _is_in(nodeid, ROS) else nodeid
 
     config.option.loadscopereorder = False  # they are in order

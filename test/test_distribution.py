@@ -20,7 +20,7 @@ NAME = 'mddag_executor'
 SHARE = f'share/{NAME}'
 ROS = ('ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch', 'launch_ros',
        'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'rosidl_parser', 'std_msgs')
-OPTIONAL = ('distributed', 'llvmlite', 'matplotlib', 'numba', 'perfetto', 'pyarrow')
+OPTIONAL = ('distributed', 'llvmlite', 'matplotlib', 'perfetto', 'pyarrow')
 BLOCKER = """
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.machinery import PathFinder
@@ -81,7 +81,7 @@ def test_says_in_one_line_what_is_missing(tmp_path, missing, extra, commands):
         assert {'distributed': 'Dask'}.get(missing, missing) in errors
     assert [path.name for path in tmp_path.iterdir()] == ['graph.yaml']
 
-HEAVY = {'ctypes', 'distributed', 'llvmlite', 'lz4', 'matplotlib', 'mcap', 'numba',
+HEAVY = {'ctypes', 'distributed', 'llvmlite', 'lz4', 'matplotlib', 'mcap',
          'numpy', 'perfetto', 'pyarrow', 'rclpy', 'rosbags', 'ruamel', 'yaml', 'zstandard'}
 
 

@@ -5,7 +5,7 @@ The parts of the program know one another in one direction only.
 
     cli -> rerun -> hosting -> report, synthetic
         -> (executor | laboratory | whatif -> analysis -> sources)
-        -> simulate, recording -> trace, core -> msg_graph
+        -> simulate, recording -> trace, core, compiler -> msg_graph
 
 Imports are read from the sources, those inside functions and for type checkers included. Ruff
 (`SLF`) checks which modules use private names of rclpy.
@@ -24,7 +24,7 @@ LEVELS = {part: level for level, parts in enumerate((
                      'mddag_executor.text', 'mddag_executor.results'),
     ('mddag_executor.resources', 'mddag_executor.child'),
     ('mddag_executor',),  # its __init__.py, to those who want the version
-    ('mddag_executor.core', 'mddag_executor.trace'),
+    ('mddag_executor.core', 'mddag_executor.trace', 'mddag_executor.compiler'),
     # simulate is below whatif, which reschedules with its engine
     ('mddag_executor.recording', 'mddag_executor.simulate'),
     ('mddag_executor.sources',), ('mddag_executor.analysis',),

@@ -36,10 +36,10 @@ THIRD_PARTY = {
         'launch', 'launch_ros', 'rcl_interfaces', 'rclpy', 'ros2cli', 'rosgraph_msgs',
         'rosidl_parser', 'std_msgs')},
     **{name: (None, name) for name in (
-        'distributed', 'matplotlib', 'numba', 'pandas', 'pyarrow')},
+        'distributed', 'llvmlite', 'matplotlib', 'pandas', 'pyarrow')},
     **{name: ('mcap-ros2-support', name) for name in ('lz4', 'mcap', 'zstandard')},
     'argcomplete': ('python3-argcomplete', 'argcomplete'), 'dask': (None, 'distributed'),
-    'llvmlite': (None, 'numba'), 'numpy': ('python3-numpy', 'numpy'),
+    'numpy': ('python3-numpy', 'numpy'),
     'rosbags': ('python3-rosbags-pip', 'rosbags'), 'yaml': ('python3-yaml', 'PyYAML'),
 }
 

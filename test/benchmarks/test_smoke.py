@@ -30,7 +30,7 @@ def call(*arguments):
     return subprocess.run(
         [sys.executable, '-m', 'benchmarks', *map(str, arguments)], cwd=TOP,
         capture_output=True, text=True, check=False, timeout=150,
-        env={**os.environ, 'NUMBA_DISABLE_JIT': '1', 'MDDAG_DEBUG': ''})
+        env={**os.environ, 'MDDAG_PLAIN': '1', 'MDDAG_DEBUG': ''})
 
 
 def result_of(*arguments):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 
+from mddag_executor.simulate import compiled
 from msg_graph import load
 from msg_graph.model import load_of
 import pytest
@@ -31,32 +32,35 @@ def test_figure(graph, tmp_path, call, ending, start):
             assert text in pictures[0]
 
 
-@pytest.mark.parametrize('compiled', [False, True])
-def test_interrupted(graph, compiled):
+@pytest.mark.parametrize('core', ['plain', 'compiled', 'compiling'])
+def test_interrupted(graph, core):
     """Ctrl-C: the exit status is 130, and what is done is written as a whole."""
-    if compiled:
-        pytest.importorskip('numba')
+    if core != 'plain':
+        pytest.importorskip('llvmlite', reason='llvmlite is not there')
+    if core == 'compiled':
+        compiled.prepare()
     with subprocess.Popen(
-            [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '500000',
+            [sys.executable, '-m', 'mddag_executor', 'evaluate', str(graph), '--runs', '10000000',
              '--parallel', '1', '--json', 'out.json', '--plot', 'out.png'],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-            env={**os.environ, 'NUMBA_DISABLE_JIT': str(int(not compiled)),
-                 'NUMBA_CACHE_DIR': str(graph.parent / 'cache')}) as process:
+            env={**os.environ, 'MDDAG_PLAIN': '1' if core == 'plain' else '',
+                 **({'XDG_CACHE_HOME': str(graph.parent)} if core == 'compiling' else {})},
+    ) as process:
 
         def seconds():
             fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
             return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
-        wait_for_run(process, lambda: seconds() > 4)    # compiling takes half a minute
+        wait_for_run(process, lambda: seconds() > (1 if core == 'compiling' else 3))
         os.killpg(process.pid, signal.SIGINT)
         out, err = process.communicate(timeout=120)
     assert process.returncode == 130
-    if compiled:
-        assert (out, err) == ('', 'warning: interrupted: 0 of 500000 runs are done\n')
+    if core == 'compiling':
+        assert (out, err) == ('', 'warning: interrupted: 0 of 10000000 runs are done\n')
         return
     result = json.loads(Path('out.json').read_text())
-    assert err == f"warning: interrupted: {result['runs']} of 500000 runs are done\n"
-    assert 0 < result['runs'] < 500000 and result['interrupted'] is True
+    assert err == f"warning: interrupted: {result['runs']} of 10000000 runs are done\n"
+    assert 0 < result['runs'] < 10000000 and result['interrupted'] is True
     assert Path('out.png').stat().st_size > 5000 and f"{result['runs']} runs in" in out
 
 

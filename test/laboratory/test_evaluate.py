@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 import yaml
 
-NEEDS_NUMBA = pytest.mark.skipif(not compiled.available(), reason='numba is not there')
+NEEDS_COMPILER = pytest.mark.skipif(not compiled.available(), reason='llvmlite is not there')
 
 REFERENCE_COUNTS = (8, 122, 472, 907, 1166, 992, 657, 388, 177, 71, 40)
 REFERENCE = {
@@ -64,7 +64,7 @@ def small():
     return loads(SMALL, 'small.yaml')
 
 
-@NEEDS_NUMBA
+@NEEDS_COMPILER
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_the_paper_s_figure(autoware):

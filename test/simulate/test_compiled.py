@@ -8,7 +8,10 @@ Both are the same source; what this finds is where compiled arithmetic, lists or
 
 from dataclasses import replace
 from itertools import accumulate
+import os
+from pathlib import Path
 import random
+import shutil
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -23,10 +26,7 @@ import pytest
 from ..conftest import examples, run_program
 from ..core.task_sets import cases, TICK
 
-pytestmark = [
-    pytest.mark.skipif(not compiled.available(), reason='numba is not there'),
-    pytest.mark.timeout(400),  # a first run compiles
-]
+pytestmark = pytest.mark.skipif(not compiled.available(), reason='llvmlite is not there')
 EVERY_RULE = cases(overheads=True, importance=True)
 
 
@@ -145,32 +145,58 @@ def test_runs_do_not_disturb_one_another(case, horizon, judge, data):
     assert found.tolist() == plain.tolist()
 
 
-def test_numba_is_not_imported_to_find_stored_code():
-    compiled.prepare()
-    run_program(
-        'import sys, mddag_executor.laboratory.evaluate\n'
-        'from mddag_executor.simulate import compiled\n'
-        'assert compiled.pays(2.0)\n'
-        'compiled._hash_of_sources = lambda: "another"\n'
-        'assert not compiled.pays(2.0)\n'
-        'assert not {"numba", "matplotlib"} & {*sys.modules}')
-
-
-COUNT_COMPILED = """
+COMPILE = """
 import sys
 from mddag_executor.simulate import compiled
-if sys.argv[1:]:
-    compiled._hash_of_sources = lambda: sys.argv[1]
-entry = compiled.entry_points()['free_run']
-memory = [compiled.Memory(*[0] * 99) for _ in range(4)]
-entry(*(each.address for each in memory))
-print(sum(entry.stats.cache_hits.values()), sum(entry.stats.cache_misses.values()))
+pays = compiled.pays(0.1)
+assert 'llvmlite' not in sys.modules
+compiled.prepare()
+print(pays, 'mddag_executor.simulate.kernel' in sys.modules)
 """
 
 
-@pytest.mark.slow
-def test_compiled_code_is_kept_until_a_source_changes(tmp_path, monkeypatch):
-    """The hash of the sources decides, not only the file that numba checks."""
-    monkeypatch.setenv('NUMBA_CACHE_DIR', str(tmp_path))
-    assert [run_program(COUNT_COMPILED, *hashed)[0] for hashed in ([], [], ['another'])] == [
-        '0 1\n', '1 0\n', '0 1\n']
+def test_compiled_code_is_stored(tmp_path, monkeypatch):
+    """It is used if it is whole; a folder that is not writable changes nothing but the time."""
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+
+    def compiles():
+        return run_program(COMPILE)[0]
+
+    assert compiles() == 'False True\n'
+    assert compiles() == 'True False\n'
+    stored, = (path for path in (tmp_path / 'cache').rglob('*') if path.is_file())
+    whole = stored.read_bytes()
+    stored.write_bytes(whole[:-100])
+    assert compiles() == 'False True\n' and stored.read_bytes() == whole
+    monkeypatch.setenv('XDG_CACHE_HOME', '/dev/null')
+    assert compiles() == 'False True\n'
+
+
+def test_stored_code_is_that_of_the_sources(tmp_path, monkeypatch):
+    package = Path(compiled.__file__).parent.parent
+    for folder in ('core', 'compiler', 'simulate'):
+        shutil.copytree(package / folder, tmp_path / folder)
+    monkeypatch.setattr(compiled, '__file__', str(tmp_path / 'simulate' / 'compiled.py'))
+    path_of = compiled._path.__wrapped__
+    assert path_of() == compiled._path()
+    found = {path_of()}
+    for source in ('core/queues.py', 'compiler/writer.py', 'simulate/engine.py'):
+        with (tmp_path / source).open('a') as file:
+            file.write('#')
+        found.add(path_of())
+    assert len(found) == 4
+
+
+def test_only_the_newest_versions_remain(tmp_path, monkeypatch):
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    folder = compiled._path.__wrapped__().parent
+    folder.mkdir()
+    for number in range(20):
+        old = folder / f'core-{number:02}.bin'
+        old.touch()
+        os.utime(old, (number, number))
+    monkeypatch.setattr(compiled, '_path', lambda: folder / 'core-new.bin')
+    compiled._store(b'code')
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *(f'core-{number}.bin' for number in range(13, 20)), 'core-new.bin']
+    assert compiled._stored_code() == b'code'
