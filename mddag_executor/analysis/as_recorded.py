@@ -144,7 +144,7 @@ class Replay:
         more: ReplayResultRare = {}
         if requirements := self.requirements.result():
             more['requirements'] = requirements
-        if recording.run.imported:
+        if recording.run.imported or not self.task_set.dags:
             more['recorded_callbacks'] = recorded_callbacks(recording)
             more['communications'] = communications(recording)
         verdicts = self.tally.result()

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Executions of callbacks and transport of messages in an imported recording."""
+"""Executions of callbacks and transport of messages, of a recording without jobs as well."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ if TYPE_CHECKING:
 
 def recorded_callbacks(recording: Recording) -> dict[str, RecordedCallback]:
     """Return counts and times (ns) of each recorded callback that ran."""
-    start, end = (recording.executions[name] for name in ('start', 'end'))
+    start, end, piece = (recording.executions[name] for name in ('start', 'end', 'piece'))
     numbers, index = different(recording.executions['callback'])
     found: dict[tuple[str, int], RecordedCallback] = {}
     for number, mine in zip(numbers.tolist(), rows_by(index, len(numbers))):
         ended = mine[end[mine] >= 0]
         took = end[ended] - start[ended]
         found[recording.names.name(number), number] = {
-            'executions': len(took), 'unfinished': len(mine) - len(took),
+            # a coroutine that waited is one execution
+            'executions': int((piece[ended] == 0).sum()), 'unfinished': len(mine) - len(took),
             'busy_ns': sum_of(took), 'shortest_ns': int(took.min()) if len(took) else 0,
             'longest_ns': max(0, int(took.max(initial=0)))}
     return {label: each for (label, _), each in sorted(found.items(), key=lambda item: item[0])}

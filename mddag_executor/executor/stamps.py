@@ -44,7 +44,7 @@ class StampedReleases:
             self._named.add(topic)
             self._warn(
                 f'{topic}: the header stamps are {abs(away) / 1e9:.0f} s '
-                f'{"behind" if away < 0 else "ahead of"} the system clock (simulated time, a '
-                'played bag, or the clock of another machine): jobs are released when their '
-                'messages arrive')
+                f'{"before" if away < 0 else "after"} the arrivals of their messages (simulated '
+                'time, a played bag, or the clock of another machine): jobs are released at the '
+                'arrivals')
         return now

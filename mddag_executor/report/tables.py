@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from mddag_executor.core.policies import SIMULATED_ONLY
 from mddag_executor.core.requirements import as_dags, Requirements
 from mddag_executor.core.tally import Counts, counts, is_kept, never_due, total
 from mddag_executor.report.text import Cell, format_ns, listed, printable, table
@@ -225,7 +226,8 @@ def guessed_lines(guessed: Mapping[str, int]) -> Iterator[str]:
 
 def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:
     """Yield the lines about a run, below a table of its sinks; ``more`` about its settings."""
-    yield verdicts_line(result['dags'])
+    yield verdicts_line(result['dags']) if result['dags'] else (
+        'no declaration was given, so no deadline was judged (mddag graph from-trace drafts one)')
     yield from never_due_lines(result['dags'])
     yield (f'{pool_text(result)}, {format_ns(result["duration_ns"])}, '
            f'utilisation {ratio(result["utilisation"])}{more}')
@@ -238,7 +240,7 @@ def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:
 
 def pool_text(result: Mapping[str, Any]) -> str:
     """Return what ran the callbacks of a run."""
-    if 'recorded_callbacks' in result:
+    if 'recorded_callbacks' in result and result['policy'] in SIMULATED_ONLY:
         return f'imported: {counted(result["workers"], "thread")} ran callbacks'
     several = counted(len(result.get('processes', ())), 'process', 'processes')
     return (f'policy {printable(result["policy"])}, {counted(result["workers"], "worker")}'

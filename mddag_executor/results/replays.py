@@ -323,9 +323,10 @@ class ReplayResultRare(TypedDict, total=False):
     requirements: Requirements
     """Only if the declaration requires a `reaction` or an `age` of paths."""
     recorded_callbacks: dict[str, RecordedCallback]
-    """Only of an imported recording: all recorded callbacks."""
+    """Only of an imported recording, and without a declaration: all recorded callbacks."""
     communications: list[Communication]
-    """Only of an imported recording: messages by publisher and callback."""
+    """Only of an imported recording, and without a declaration: messages by publisher and
+    callback."""
     drift: list[DriftResult]
     """How the run differs from its declaration (not in the sides of `diff`)."""
 

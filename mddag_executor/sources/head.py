@@ -44,9 +44,7 @@ def read_head(reader: TraceReader) -> Head | None:
 def declared(head: Head, name: str) -> TaskSet:
     """Return the declaration of a recorded run."""
     if not is_declared(head):
-        raise ReplayError(
-            name, 'it was recorded without a declaration, so there are no jobs',
-            'give the GRAPH that judges it (mddag graph from-trace drafts one)')
+        raise without_declaration(name)
     try:
         return loads(
             _GONE.sub(r'\1demote', _RENAMED.sub('on_late', head.yaml)), head.file or name)
@@ -54,6 +52,13 @@ def declared(head: Head, name: str) -> TaskSet:
         raise ReplayError(
             name, f'the declaration that it was recorded with is wrong ({error})',
             'record the run again') from None
+
+
+def without_declaration(name: str) -> ReplayError:
+    """Return the error for a run of this executor without a declaration."""
+    return ReplayError(
+        name, 'it was recorded without a declaration, so there are no jobs',
+        'give the GRAPH that judges it (mddag graph from-trace drafts one)')
 
 
 def damage(warnings: Iterable[str], path: str, name: str) -> list[Loss]:

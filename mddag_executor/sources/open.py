@@ -11,7 +11,7 @@ import os
 from mddag_executor.recording.head import is_declared, ReplayError
 from mddag_executor.recording.mapping import judged_by
 from mddag_executor.recording.recording import Recording
-from mddag_executor.sources.head import named_errors, read_head
+from mddag_executor.sources.head import named_errors, read_head, without_declaration
 from mddag_executor.sources.own import read_own
 from mddag_executor.trace import TraceReader
 from msg_graph import EMPTY_TASK_SET, load, TaskSet
@@ -75,10 +75,10 @@ def open_recording(
         if head is None:
             from mddag_executor.sources.imported_run import ImportedRun
             return ImportedRun(reader, name, task_set, progress=progress).read()
-        if task_set is None or is_declared(head):
+        if is_declared(head):
             return judged_by(read_own(reader, name, head, progress), task_set)
         from mddag_executor.sources.undeclared_run import UndeclaredRun
-        return UndeclaredRun(reader, name, task_set, head, progress).read()
+        return UndeclaredRun(reader, name, task_set or EMPTY_TASK_SET, head, progress).read()
 
 
 def open_to_draft(
@@ -115,15 +115,18 @@ def check_declared(path: Given, name: str) -> None:
         path, reader = _opened(path)
         with named_errors(path, name):
             reader = reader or TraceReader(path)
-            if read_head(reader) is None:
+            head = read_head(reader)
+            if head is not None and not is_declared(head):
+                raise without_declaration(name)
+            if head is None:
                 from mddag_executor.sources.imported_run import ImportedRun
                 ImportedRun(reader, name, None)     # None: the trace is an imported one
                 raise undeclared(name)
 
 
-def undeclared(name: str) -> ReplayError:
+def undeclared(name: str, imported: bool = True) -> ReplayError:
     """Return the error for a recording without declared deadlines."""
-    return ReplayError(
+    return without_declaration(name) if not imported else ReplayError(
         name, 'it was imported, so nothing in it says which callbacks have which deadlines',
         'give the GRAPH')
 

@@ -225,7 +225,7 @@ def reschedule(
     run = path if isinstance(path, Recording) else open_recording(
         path, task_set, name, progress)
     if run.task_set is EMPTY_TASK_SET:
-        raise undeclared(run.name)
+        raise undeclared(run.name, run.run.imported)
     head, each, given = run.run.head, run.run.workers_each, policy
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
     cpus = cpus or head.cpus or None

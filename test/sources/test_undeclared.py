@@ -112,6 +112,27 @@ def test_with_an_idle_worker_a_callback_waits_for_the_interpreter(run):
     assert (causes['interpreter'], causes['waited']) == (3, 0)
 
 
+def test_without_a_declaration_its_callbacks_and_messages_are_shown(tmp_path, call):
+    trace = tmp_path / 'run.mcap'
+    undeclared(DEMO, trace)
+    declared = call('replay', DEMO, '--json', '-').result
+    page, file = tmp_path / 'page.html', tmp_path / 'result.json'
+    done = call('replay', trace, '--json', file, '--report', page)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert 'no declaration was given, so no deadline was judged' in done.stdout
+    assert 'policy rad, 7 workers' in done.stdout
+    result = json.loads(file.read_text())
+    assert sum(each['executions'] for each in result['recorded_callbacks'].values()) == sum(
+        each['executions'] for each in (*declared['callbacks'].values(), declared['undeclared']))
+    assert sum(each['arrived'] for each in result['communications']) > 100
+    for topic in {each['topic'] for each in result['communications']}:
+        assert topic in done.stdout and topic in page.read_text()
+    for verb in (['explain'], ['slack'], ['replay', '--reschedule'], ['diff', trace]):
+        done = call(*verb, trace)
+        assert done.returncode == 2
+        assert 'it was recorded without a declaration, so there are no jobs' in done.stderr
+
+
 def test_the_same_run_gets_the_same_verdicts(tmp_path, call):
     trace, graph = tmp_path / 'run.mcap', tmp_path / 'graph.yaml'
     graph.write_text(undeclared(DEMO, trace))
