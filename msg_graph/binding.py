@@ -13,14 +13,16 @@ with topics and services with names.
    the order of their declaration: nodes make their entities in the order in which tools count the
    callbacks.
 3. A sync callback has one entity for each of its topics, its *legs*.
-4. An entity without a remaining declared callback is undeclared. Its name consists of its node,
+4. A sporadic timer may be made again and again: each further timer of its node with its period is
+   bound to it; of several sporadic ones to the one with the name of the timer's function.
+5. An entity without a remaining declared callback is undeclared. Its name consists of its node,
    its function and its kind, as in `/camera: on_image (subscription /image)`.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable
-from heapq import heappop, heappush
 import re
 from typing import NamedTuple
 
@@ -35,7 +37,8 @@ _PERIOD_TOLERANCE = 2e-3
 _WORDS = {'subscription': 'topic', 'service': 'service'}
 _PYTHON = re.compile(r'(?:[\w<>]+\.)*(\w+|<lambda>)')
 _CPP = re.compile(r'[\w:<>*& ]*?\b(\w+)\([^()]*\)')
-_BACKGROUND_TOPICS = {'/rosout', '/parameter_events', '/clock', '/diagnostics'}
+_BACKGROUND_TOPICS = {'/rosout', '/parameter_events', '/clock'}
+_MONITORING_TOPIC = '/diagnostics'
 _ANNOUNCEMENTS = '/mddag/jobs_'  # with them the processes of a run find each other's jobs
 _BACKGROUND_SERVICES = {
     'describe_parameters', 'get_parameter_types', 'get_parameters', 'list_parameters',
@@ -72,14 +75,14 @@ class Binder:
         self._place = task_set.callback_indices()
         self._free: dict[Entity, list[int]] = {}
         self._timers: dict[str, set[Entity]] = {}
-        self._bound: set[tuple[int, Entity]] = set()
+        self._bound: Counter[tuple[int, Entity]] = Counter()
         for place, callback in enumerate(task_set.callbacks):
             for entity in entities_of(callback):
                 self._free.setdefault(entity, []).append(place)
                 if entity.kind == 'timer':
                     self._timers.setdefault(entity.node, set()).add(entity)
 
-    def bind(self, entity: Entity) -> Callback | None:
+    def bind(self, entity: Entity, function: str | None = None) -> Callback | None:
         """
         Return the callback of an entity; of a sync callback's leg, the sync callback.
 
@@ -87,6 +90,7 @@ class Binder:
         period of a timer may differ by 0.2 %; of several timers the nearest one is bound.
 
         :param entity: with the full names of its node and of its topic or service.
+        :param function: the name of its function, if known.
         """
         if entity.kind == 'timer':
             period = entity.period_ns or 0
@@ -97,13 +101,28 @@ class Binder:
         free = self._free.get(entity)
         if not free:
             return None
-        place = heappop(free)
-        self._bound.add((place, entity))
+        place = self._next(free, function)
+        self._bound[place, entity] += 1
         return self._callbacks[place]
+
+    def _next(self, free: list[int], function: str | None) -> int:
+        """Return the callback to bind next; a sporadic timer stays free."""
+        again = [place for place in free if self._is_made_again(place)]
+        if len(again) == len(free):
+            return next(
+                (each for each in again if self._callbacks[each].name == function), min(again))
+        place = min(set(free).difference(again))
+        free.remove(place)
+        return place
+
+    def _is_made_again(self, place: int) -> bool:
+        callback = self._callbacks[place]
+        return callback.kind == 'timer' and callback.sporadic
 
     def unbound(self) -> list[Callback]:
         """Return the callbacks without an entity, or syncs without one for each leg."""
-        places = {place for free in list(self._free.values()) for place in free}
+        places = {place for entity, free in list(self._free.items()) for place in free
+                  if not self._bound[place, entity]}
         return [self._callbacks[place] for place in sorted(places)]
 
     def release(self, callback: Callback, topic: str | None = None) -> None:
@@ -115,12 +134,13 @@ class Binder:
         """
         place = self._place[callback.key]
         bound = [entity for entity in entities_of(callback)
-                 if topic in (None, entity.start) and (place, entity) in self._bound]
+                 if topic in (None, entity.start) and self._bound[place, entity]]
         if not bound:
             raise KeyError(callback.key if topic is None else topic)
         for entity in bound:
-            self._bound.remove((place, entity))
-            heappush(self._free[entity], place)
+            self._bound[place, entity] -= 1
+            if not self._is_made_again(place):
+                self._free[entity].append(place)
 
 
 def is_period(period_ns: int, declared_ns: int) -> bool:
@@ -195,3 +215,13 @@ def is_background(name: str, node: str) -> bool:
     return (name in _BACKGROUND_TOPICS or name.startswith(_ANNOUNCEMENTS)
             or '/_action/' in name or word in _BACKGROUND_SERVICES
             or (word in _LIFECYCLE and before == node))
+
+
+def is_side_output(topic: str, node: str) -> bool:
+    """
+    Return whether a topic says nothing about what a callback publishes for others.
+
+    Those are background topics, and ``/diagnostics``, on which nearly every node and the executor
+    itself report their states.  A subscription of it is an ordinary callback.
+    """
+    return topic == _MONITORING_TOPIC or is_background(topic, node)

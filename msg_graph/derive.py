@@ -185,9 +185,9 @@ class _Links:
         if callback.once and callback.kind != 'timer':
             raise error('once', 'only a timer can fire once',
                         "remove 'once:'; a source that comes now and then has 'sporadic: true'")
-        if callback.sporadic and callback.kind == 'timer':
-            raise error('sporadic', 'a timer has a fixed period',
-                        "remove 'sporadic:'; a timer that fires once has 'once: true'")
+        if callback.once and callback.sporadic:
+            raise error('once', 'a timer fires once, or now and then, not both',
+                        "remove 'once:' if the timer is made again or reset, else 'sporadic:'")
         if not callback.judged and (callback.tolerate or callback.importance != 'normal'):
             key = 'tolerate' if callback.tolerate else 'importance'
             raise error(key, 'it has no deadline that could be missed',

@@ -21,19 +21,24 @@ the declaration (``open_blanks``), since most others follow from them:
 
 ``accept`` uses the recording instead of asking: measured periods and proposed deadlines become
 entries, only recorded publications count, and a source with an unknown rate is left out
-(``leave_out_sources``).
+(``leave_out_sources``).  So is a callback that a rule of the model refuses, such as one of a
+cycle: an accepted draft is always a valid declaration.
+
+A recording may begin late or end early.  A draft names nothing that is not in it: variables and
+topics that are read, topics of a sync, callbacks of a path.
 
 A named path becomes an entry if each of its nodes has exactly one matching callback.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 from msg_graph.blanks import MARK
+from msg_graph.derive import loads
 from msg_graph.duration import exact_duration, format_duration, MICROSECOND
-from msg_graph.errors import printable
+from msg_graph.errors import GraphError, printable
 from msg_graph.language import PATH
 from msg_graph.model import ExecutionTime, ReleaseFrom
 from msg_graph.yamltext import plain_scalar
@@ -163,17 +168,37 @@ def leave_out_sources(
     while True:
         published = {topic for callback in draft.callbacks()
                      for topic in callback.publishes + callback.possible_topics}
-        found = {callback.key for callback in draft.callbacks()
+        found = {callback.key: reason for callback in draft.callbacks()
                  if _is_source(callback, published) and which(callback)}
+        for callback in draft.callbacks():
+            missing = [topic for topic in callback.triggers if topic not in published]
+            if callback.kind == 'sync' and callback.driven_by is None and missing:
+                found[callback.key] = f'no callback publishes {missing[0]}'
         if not found:
             return
-        for node in draft.nodes:
-            for callback in list(node.callbacks.values()):
-                if callback.key in found:
-                    del node.callbacks[callback.name]
-                    what = ' '.join((callback.kind, *callback.started_by))
-                    draft.left_out.append(f'{callback.key} ({what}): {reason}')
-        draft.nodes = [node for node in draft.nodes if node.callbacks]
+        _leave_out(draft, found)
+
+
+def _leave_out(draft: Draft, reasons: Mapping[str, str]) -> None:
+    """Leave out callbacks, each with a reason."""
+    for node in draft.nodes:
+        for callback in list(node.callbacks.values()):
+            if callback.key in reasons:
+                del node.callbacks[callback.name]
+                what = ' '.join((callback.kind, *callback.started_by))
+                draft.left_out.append(f'{callback.key} ({what}): {reasons[callback.key]}')
+    draft.nodes = [node for node in draft.nodes if node.callbacks]
+    leave_out_paths(draft)
+
+
+def leave_out_paths(draft: Draft) -> None:
+    """Leave out declared paths of which a callback is not in the draft."""
+    keys = {callback.key for callback in draft.callbacks()}
+    for path in list(draft.paths):
+        missing = next((key for key in path.keys if key not in keys), None)
+        if missing is not None:
+            draft.paths.remove(path)
+            draft.left_out.append(f'path {path.name}: {missing} is not in it')
 
 
 def _is_source(callback: DraftCallback, published: Container[str]) -> bool:
@@ -186,8 +211,30 @@ def accept(draft: Draft) -> None:
     """Replace unknown values by recorded ones, so that the periods of all sources are known."""
     for callback in draft.callbacks():
         callback.possible_topics.clear()
-    leave_out_sources(draft, lambda callback: callback.source_period_ns is None,
-                      'its rate is unknown')
+    while True:
+        leave_out_sources(draft, lambda callback: callback.source_period_ns is None,
+                          'its rate is unknown')
+        if not draft.nodes:
+            return
+        writer = _Writer(draft, accepted=True)
+        try:
+            loads('\n'.join(writer.lines()))
+            return
+        except GraphError as error:
+            _leave_out_refused(draft, writer, error)
+
+
+def _leave_out_refused(draft: Draft, writer: _Writer, error: GraphError) -> None:
+    """Leave out the callback, or the path, that an error of the drafted declaration is about."""
+    entry = writer.entry_at(error.line or 0)
+    reason = error.problem.partition(': ')[2] or error.problem    # without the entry's name
+    if isinstance(entry, DraftCallback):
+        _leave_out(draft, {entry.key: reason})
+    elif isinstance(entry, DraftPath):
+        draft.paths.remove(entry)
+        draft.left_out.append(f'path {entry.name}: {reason}')
+    else:
+        raise error
 
 
 def declaration_of(draft: Draft, accepted: bool = False) -> str:
@@ -209,6 +256,14 @@ class _Writer:
             for topic in callback.triggers:
                 self._started.setdefault(topic, []).append(callback)
         self._fastest = self._fastest_sources()
+        # the entry that begins with the next line, and the entries by their first line, from 1
+        self._next: DraftCallback | DraftPath | None = None
+        self._entries_at: dict[int, DraftCallback | DraftPath] = {}
+
+    def entry_at(self, line: int) -> DraftCallback | DraftPath | None:
+        """Return the callback or path that a line belongs to, once all lines have been made."""
+        first = max((number for number in self._entries_at if number <= line), default=None)
+        return None if first is None else self._entries_at[first]
 
     def _is_source(self, callback: DraftCallback) -> bool:
         return _is_source(callback, self._perhaps_published)
@@ -228,6 +283,13 @@ class _Writer:
         return found
 
     def lines(self) -> Iterator[str]:
+        """Yield the lines of the declaration."""
+        for number, line in enumerate(self._lines(), 1):
+            if self._next is not None:
+                self._entries_at[number], self._next = self._next, None
+            yield line
+
+    def _lines(self) -> Iterator[str]:
         yield f'# From {printable(self._draft.origin)}.'
         if self._accepted:
             yield "# Values marked 'proposed' come from the recording, not from requirements."
@@ -248,6 +310,7 @@ class _Writer:
             yield '    callbacks:'
             yield from self._possible_syncs(node)
             for callback in node.callbacks.values():
+                self._next = callback
                 yield f'      - name: {plain_scalar(callback.name)}'
                 yield from (f'        {line}' for line in self._entries(callback))
         yield from self._paths()
@@ -288,13 +351,18 @@ class _Writer:
         if always := [t for t in callback.publishes if t not in callback.sometimes]:
             yield f'publishes: {_listed(always)}'
         yield from self._sometimes(callback)
-        if callback.reads:
-            yield f'reads: {_listed(map(plain_scalar, callback.reads))}'
+        if reads := [read for read in callback.reads if self._is_known(callback.node, read)]:
+            yield f'reads: {_listed(map(plain_scalar, reads))}'
         if self._started.keys().isdisjoint(callback.publishes):
             yield self._deadline(callback)
         yield from (f'{key}: {value}' for key, value in callback.other_keys.items())
         if callback.times is not None:
             yield from _execution_time(*callback.times)
+
+    def _is_known(self, node: str, read: str) -> bool:
+        """Return whether a topic, or a variable of a node, that is read is in the draft."""
+        return read in self._perhaps_published if read.startswith('/') else any(
+            callback.key == f'{node}:{read}' for callback in self._callbacks)
 
     @staticmethod
     def _sometimes(callback: DraftCallback) -> Iterator[str]:
@@ -358,6 +426,7 @@ class _Writer:
             yield 'paths:'
         for path, keys in found:
             if keys:
+                self._next = path
                 yield f'  - name: {plain_scalar(path.name)}'
                 yield '    callbacks:'
                 yield from (f"      - '{key}'" for key in keys)

@@ -8,7 +8,7 @@ Theory of operation
 The rules are the same for live runs and recordings. Observations are counts by callback.
 
 1. *publishes*: a callback published a topic that it does not declare. Topics of the client library
-   do not count.
+   and ``/diagnostics`` do not count.
 2. *rate* of a source: its timer was created with another period, or the mean time between two
    releases differs from the declared period by more than ``TOLERANCE`` of it. At least ``LEAST``
    releases are needed. A sporadic source may be released less often.
@@ -37,7 +37,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from msg_graph.binding import Entity, is_background, is_period, suggest_entity
+from msg_graph.binding import Entity, is_period, is_side_output, suggest_entity
 from msg_graph.duration import format_duration
 from msg_graph.errors import printable
 from msg_graph.model import (
@@ -53,6 +53,8 @@ from msg_graph.model import (
 TOLERANCE = 0.2
 LEAST = 10
 SILENCE_NS = 1_000_000_000
+_SPORADIC = 'has no fixed rate', 'is made, reset or cancelled when needed'
+"""What ``sporadic`` says of a subscription or service, and of a timer."""
 
 
 @dataclass
@@ -88,6 +90,7 @@ class Observed:
     :ivar publishes: by callback, the topics that it published, declared or not.
     :ivar nodes: the nodes that were seen; None if unknown.
     :ivar undeclared: the undeclared entities that were seen.
+    :ivar blocked: callbacks that cannot run, as an execution has not ended: they have not stopped.
     :ivar periods: by timer, the period with which it was created, ns; without unknown ones.
     """
 
@@ -101,6 +104,7 @@ class Observed:
     undeclared: Sequence[Entity] = ()
     periods: Mapping[str, int] = field(default_factory=dict)
     end_ns: int = 0
+    blocked: Set[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,7 @@ def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
     found: dict[str, list[Drift]] = {}
     for callback in task_set.callbacks:
         extra = [topic for topic in sorted(observed.publishes.get(callback.key, ()))
-                 if topic not in callback.publishes and not is_background(topic, callback.node)]
+                 if topic not in callback.publishes and not is_side_output(topic, callback.node)]
         found[callback.key] = [
             Drift('publishes', callback.key, topic, None, None,
                   printable(f'{callback.key} publishes {topic}, which it does not declare'))
@@ -211,24 +215,28 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
             f'the timer of {callback.key} has a period of {format_duration(created)}, and '
             f'{format_duration(declared)} is declared'))
     releases = observed.releases.get(callback.key, Releases())
-    if releases.count == 1 and callback.kind == 'timer' and not callback.once and (
+    is_regular = not (callback.once or callback.sporadic)
+    if releases.count == 1 and callback.kind == 'timer' and is_regular and (
             observed.duration_ns > LEAST * period):
         return Drift('rate', callback.key, None, period, None, printable(
             f'{callback.key} was released once in {observed.duration_ns / 1e9:.3f} s, and every '
-            f"{format_duration(period)} is declared: if it fires once, declare 'once: true'"))
+            f"{format_duration(period)} is declared: if it fires once, declare 'once: true'; if "
+            "it is made again or reset when needed, 'sporadic: true'"))
     mean = releases.mean_ns() if releases.count >= LEAST else period
     if abs(mean - period) > TOLERANCE * period and not (callback.sporadic and mean > period):
         text = (f'{callback.key} was released every {format_duration(mean)}, and '
                 f'{format_duration(period)} is declared')
-        if mean > period and callback.kind != 'timer':
-            text += ": if it has no fixed rate, declare 'sporadic: true'"
+        if mean > period:
+            text += f": if it {_SPORADIC[callback.kind == 'timer']}, declare 'sporadic: true'"
         return Drift('rate', callback.key, None, period, mean, printable(text))
     silent = observed.end_ns - releases.last
-    if releases.count > 1 and silent > max(SILENCE_NS, LEAST * period) and not (
-            callback.sporadic or callback.once):
-        return Drift('stopped', callback.key, None, period, silent, printable(
-            f'{callback.key} was not released any more in the last {silent / 1e9:.3f} s, and '
-            f'every {format_duration(period)} is declared'))
+    if releases.count > 1 and silent > max(SILENCE_NS, LEAST * period) and is_regular and (
+            callback.key not in observed.blocked):
+        text = (f'{callback.key} was not released any more in the last {silent / 1e9:.3f} s, and '
+                f'every {format_duration(period)} is declared')
+        if callback.kind == 'timer':
+            text += f": if it {_SPORADIC[True]}, declare 'sporadic: true'"
+        return Drift('stopped', callback.key, None, period, silent, printable(text))
     return None
 
 

@@ -524,7 +524,8 @@ CALLBACK_KEYS = {
     'once': Key(_FLAG, 'Whether a timer fires only once, as it is cancelled in its callback.',
                 of=('source',)),
     'sporadic': Key(_FLAG, 'Whether the period of a source is only the least time between two '
-                    'releases.', of=('source',)),
+                    'releases; of a timer, whether it is made, reset or cancelled when needed.',
+                    of=('source',)),
     'release_from': Key(choice('arrival', 'source_timestamp', 'header_stamp', missing='arrival'),
                         'Where the release time of a source comes from.', of=('source',)),
     'execution_time': Key(_EXECUTION_TIME, 'Its execution time: constant, or quantiles.'),

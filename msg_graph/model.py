@@ -116,7 +116,7 @@ class Callback:
     :ivar tolerate: of a sink: how many deadline misses are tolerated, or None.
     :ivar judged: of a sink: False if it has no deadline to be judged by (``deadline: none``).
     :ivar once: of a timer: whether it fires only once.
-    :ivar sporadic: of a source that is not a timer: whether ``period_ns`` is only the least time
+    :ivar sporadic: of a source: whether ``period_ns`` is only the least time
         between two releases.
     :ivar driven_by: of a sync of different rates: the topic each message of which has a result;
         the others are queue edges.  None for other syncs.

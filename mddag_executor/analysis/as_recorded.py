@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         ReplayResult,
         ReplayResultRare,
     )
-    from mddag_executor.results.sinks import DagCounts, SinkCounts, SlackTimes
+    from mddag_executor.results.sinks import DagCounts, SinkCounts, SlackTimes, UnfinishedRun
 
 
 class Replay:
@@ -116,6 +116,13 @@ class Replay:
         from mddag_executor.recording.frames import frame_of
         return frame_of(self.to_arrow(name))
 
+    def unfinished(self) -> list[UnfinishedRun]:
+        """Return the executions that had not ended when the recording did."""
+        recording = self.recording
+        return [{'callback': recording.callback_name(callback), 'since_ns': start,
+                 'for_ns': max(0, recording.end - start), 'where': recording.names.places[where]}
+                for _, callback, start, where in recording.unfinished.tolist()]
+
     def drift(self) -> list[Drift]:
         """Return the differences between the run and the declaration."""
         return drift_of(self.recording, self.judged.skip)
@@ -139,6 +146,8 @@ class Replay:
         paths = self.paths.results()    # first, because they need the most memory
         give_back()
         guesses: ReplayResultRare = {}
+        if unfinished := self.unfinished():
+            guesses['unfinished'] = unfinished
         if guessed := recording.guessed:
             guesses['guessed'] = guessed
         more: ReplayResultRare = {}

@@ -17,6 +17,8 @@ along its critical chain (see ``chains``):
 * the time that a job *waited*, or waited for the *interpreter*, after its demotion counts as
   *demoted*; or as *less important* if the job could still have been in time when it was demoted,
   so that it only made way for more important work;
+* callback that had not ended when the recording did (``recording.unfinished``), and had run for
+  ``HANGS_NS``: *never ended*, and so is the time that others of its group waited for it;
 * running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
@@ -56,10 +58,10 @@ import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
           'demoted', 'less important', 'dropped', 'destroyed', 'not published', 'lost', 'failed',
-          'other topic')
+          'other topic', 'never ended')
 (WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, DEMOTED, LESS_IMPORTANT,
- DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, OTHER_TOPIC, RAN_USUALLY, UNKNOWN, SKIPPED
- ) = range(18)
+ DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, OTHER_TOPIC, NEVER_ENDED, RAN_USUALLY, UNKNOWN,
+ SKIPPED) = range(19)
 #: Kinds of time of a job; the last three are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown', 'skipped')
 #: By cause what to do about it.
@@ -85,15 +87,18 @@ REMEDIES = {
             'warnings), its end',
     'failed': 'mend what the callback raises',
     'other topic': 'let the other topics of the sync come earlier: less work before them, or '
-                   'deadlines for the callbacks that publish them'}
+                   'deadlines for the callbacks that publish them',
+    'never ended': 'mend the callback that has not ended: give what it waits for (a service, a '
+                   'lock, a future) a timeout'}
 _DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED}
 """By reason of a drop its cause; jobs are aborted because of an earlier miss: they *waited*."""
 NO_MESSAGE = (DROPPED, DESTROYED, NOT_PUBLISHED, LOST)
 """Causes for which a callback never ran."""
+HANGS_NS = 1_000_000_000
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th above the usual time is usual
 _ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
-_WAITS = (*_ON_WORKERS, INTERPRETER, GROUP)
+_WAITS = (*_ON_WORKERS, INTERPRETER, GROUP, NEVER_ENDED)
 _MOST_BEHIND = 5
 
 MISSED = np.dtype([
@@ -113,7 +118,7 @@ callback ran (see ``Pool``).
 # A time span of a miss at a vertex: of a wait its group part, of an execution its CPU time.
 _SPAN = np.dtype([
     ('miss', 'i8'), ('vertex', 'i8'), ('kind', 'i8'), ('begin', 'i8'), ('end', 'i8'),
-    ('more', 'i8'), ('place', 'i8')])
+    ('more', 'i8'), ('place', 'i8'), ('hangs', '?')])
 _LAG, _BEFORE, _WAIT, _RUN, _TRANSPORT, _OTHER_TOPIC, _PENDING = range(7)
 
 
@@ -143,6 +148,8 @@ class Pool(NamedTuple):
         recording of another executor, else its process; ``place_of_vertex``: the same of the last
         execution of each vertex, -1: none.
     :ivar threads: by thread when callbacks ran in it; None: places are processes.
+    :ivar hangs: by execution whether it never ended, and had run for ``HANGS_NS``.
+    :ivar blocked: by vertex when such an execution kept its callback group busy.
     :ivar answers: by execution whether a message of another topic than the driving one started it,
         of a driven sync.
     """
@@ -153,6 +160,8 @@ class Pool(NamedTuple):
     place_of: Ints
     place_of_vertex: Ints
     threads: dict[int, Spans] | None
+    hangs: Mask
+    blocked: dict[int, Spans]
     answers: Mask
 
     def within(self, kind: str, spans: Table) -> Ints:
@@ -281,6 +290,9 @@ def find(
     usually = np.where(left <= normal + (normal >> _ABOUT_BITS), left, normal)
     times[runs, RAN_USUALLY] = usually[runs]
     times[runs] += _ran_long(spans[runs], (left - usually)[runs], usual, pool)
+    hangs = runs & spans['hangs']
+    times[hangs, NEVER_ENDED] = times[hangs, RAN_LONG]
+    times[hangs, RAN_LONG] = 0
     _pending(rows, spans, times, left, never, pool, is_source)
     # what kept the execution before a skipped release waiting meanwhile
     skips = times[:, SKIPPED] > 0
@@ -344,7 +356,7 @@ def _spans(rows: Table, chain: Table, is_source: Any, pool: Pool) -> Table:
         columns(everyone[~some], rows['at'][~some], _PENDING, rows['release'][~some],
                 rows['until'][~some], 0, pool.place_of_vertex[rows['at'][~some]]),
         columns(of, at, _WAIT, ready, start, chain['group'], own),
-        columns(of, at, _RUN, start, done, chain['cpu'], own),
+        columns(of, at, _RUN, start, done, chain['cpu'], own, pool.hangs[chain['row']]),
         columns(of, after_vertex, onward, done, after, 0, pool.place_of_vertex[after_vertex])])
     spans = spans[spans['end'] > spans['begin']]
     return spans[np.lexsort((spans['begin'], spans['miss']))]
@@ -369,6 +381,8 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
     times[:, GROUP] = np.minimum(spans['more'], left)
     left = left - times[:, GROUP]
+    times[:, NEVER_ENDED] = _blocked(spans, times[:, GROUP], pool)
+    times[:, GROUP] -= times[:, NEVER_ENDED]
     if pool.threads is not None:
         for thread in distinct(spans['place']).tolist():
             mine = np.flatnonzero(spans['place'] == thread)
@@ -386,13 +400,23 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     times[:, WAITED] = np.where(np.isin(spans['place'], [*pool.busy]), np.minimum(
         left, pool.within('full', spans)), left)
     left = left - times[:, WAITED]
-    some = pool.within('some', spans) - times[:, WAITED] - times[:, GROUP]
+    some = pool.within('some', spans) - times[:, WAITED] - times[:, GROUP] - times[:, NEVER_ENDED]
     times[:, INTERPRETER] = np.clip(some, 0, left)
     left = left - times[:, INTERPRETER]
     nothing = left >= _NOTHING_NS
     times[nothing, MACHINE] = left[nothing]
     times[~nothing, WAITED] += left[~nothing]
     return times
+
+
+def _blocked(spans: Table, most: Ints, pool: Pool) -> Ints:
+    """Return for how long callback groups were blocked for ever in waits, of so much at most."""
+    found = np.zeros(len(spans), dtype=np.int64)
+    for vertex, blocked in pool.blocked.items():
+        mine = np.flatnonzero(spans['vertex'] == vertex)
+        found[mine] = np.minimum(
+            most[mine], blocked.within(spans['begin'][mine], spans['end'][mine]))
+    return found
 
 
 def _pending(
@@ -529,7 +553,7 @@ def behind(
         waited = np.isin(kinds[mine], _ON_WORKERS)
         times[:, waited] = [
             on_workers[key].within(begins[waited], ends[waited]) for key in keys]
-        grouped = kinds[mine] == GROUP
+        grouped = np.isin(kinds[mine], (GROUP, NEVER_ENDED))
         for vertex in distinct(parts['vertex'][grouped]).tolist():
             others = [i for i, callback in enumerate(callbacks)
                       if group_of.get(vertex, -1) != groups.get(callback, -2)]

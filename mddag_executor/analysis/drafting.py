@@ -9,14 +9,16 @@ Theory of operation
    (parameter services and the like) are ignored, and so are nodes without others.
 2. A coroutine is one execution, however often it was resumed.
 3. A callback in the recorded declaration keeps its name and the declared properties that a trace
-   does not show: deadline, queue edges, period, sync, group, name of the DAG.  Other callbacks are
-   named by their recorded function, otherwise ``callback_0``, ``callback_1``, … by node, in the
-   order of creation.
+   does not show: deadline, queue edges, period, sync, group, name of the DAG, and topics that
+   nothing published.  Other callbacks are named by their recorded function, otherwise
+   ``callback_0``, ``callback_1``, … by node, in the order of creation.
 4. A topic of a node is published by the callbacks that were seen to publish it. If none was, every
    callback of the node may publish it; for a node without callbacks a timer is assumed.
 5. A service without calls, and a subscription without messages whose topic no callback publishes,
    have no rate, so they cannot be the source of a DAG.  They are left out and reported.
-6. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
+6. A timer that was made after another one of its node, with the same period and function, had
+   fired, is the same callback, made again (``sporadic``).
+7. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
    that completed it: the others only store a message.
 """
 
@@ -38,7 +40,7 @@ from mddag_executor.recording.tables import VERTEX
 from mddag_executor.sources.open import open_to_draft, Traces
 from msg_graph import Callback as Declared
 from msg_graph import EMPTY_TASK_SET, ExecutionTime, TaskSet
-from msg_graph.binding import function_of, is_background
+from msg_graph.binding import function_of, is_background, is_side_output
 from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath, leave_out_sources
 from msg_graph.duration import DAY, exact_duration
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
@@ -117,14 +119,15 @@ class System:
         self._declared: dict[int, Declared] = {
             number: recording.task_set.vertices[vertex].callback for number, vertex in zip(
                 numbers.tolist(), recording.vertices_of_callbacks().tolist()) if vertex >= 0}
-        # those of the other topics of a driven sync run as no vertex
+        # some ran as no vertex: those of the other topics of a driven sync, and those not yet due
         for number, key in declared_keys(self._names, recording.run.recorded_set).items():
-            if number not in self._declared and (
-                    callback := recording.run.recorded_set.callback(key)).driven_by is not None:
-                self._declared[number] = callback
+            self._declared.setdefault(number, recording.run.recorded_set.callback(key))
         self._runs = {number: _runs_of(recording, chosen) for number, chosen in zip(
             numbers.tolist(), rows_by(index, len(numbers)))}
         self._find_publishers(recording)
+        #: The numbers of the timers that were made again.
+        self._made_again: set[int] = set()
+        self._join_timers()
 
     def _find_publishers(self, recording: Recording) -> None:
         """Find the topics of callbacks and nodes."""
@@ -151,6 +154,32 @@ class System:
                 runs.published[known.topic] = runs.published.get(known.topic, 0) + count
                 if known.node is not None:
                     self._publishers[known.node.name][known.topic] = True
+
+    def _join_timers(self) -> None:
+        """Join each timer with those that were made again after it had fired (rule 6)."""
+        first: dict[tuple[str, int, str], Callback] = {}
+        for entity in [each for each in self._entities if each.kind == 'timer']:
+            declared = self._declared.get(entity.number)
+            if declared is not None and not declared.sporadic:
+                continue
+            before = first.setdefault((
+                entity.node_name, entity.period if declared is None else 0,
+                entity.symbol if declared is None else declared.name), entity)
+            runs, again = (self._runs.get(each.number) for each in (before, entity))
+            if before is entity or declared is None and (
+                    not entity.symbol or runs is None
+                    or entity.made <= int(runs.starts.max(initial=0))):
+                continue
+            self._entities.remove(entity)
+            self._made_again.add(before.number)
+            if runs is not None and again is not None:
+                again = Runs(
+                    np.append(runs.starts, again.starts), np.append(runs.times, again.times),
+                    np.append(runs.whole, again.whole), runs.topics + again.topics, {
+                        topic: runs.published.get(topic, 0) + again.published.get(topic, 0)
+                        for topic in {**runs.published, **again.published}})
+            if again is not None:
+                self._runs[before.number] = again
 
     def _find_headers(self, recording: Recording) -> None:
         """Find the header stamps of messages: by topic, and of the executions of callbacks."""
@@ -197,16 +226,18 @@ class System:
             node = nodes.setdefault(entity.node_name, DraftNode(entity.node_name))
             callback = self._callback(entity, node)
             node.callbacks.setdefault(callback.name, callback)
+        self._keep_declared_topics(nodes)
         for name, topics in self._publishers.items():
-            unseen = [t for t, seen in topics.items()
-                      if not seen and not is_background(t, name) and TOPIC.fits(t)]
-            if unseen and name not in nodes and NODE.fits(name):
+            drafted = nodes[name].callbacks if name in nodes else {}
+            known = {topic for each in drafted.values() for topic in each.publishes}
+            unseen = [t for t, seen in topics.items() if not seen and t not in known
+                      and not is_side_output(t, name) and TOPIC.fits(t)]
+            if unseen and not drafted and NODE.fits(name):
                 timer = DraftCallback(name, 'callback_0', 'timer')
-                nodes[name] = DraftNode(name, {timer.name: timer})
-            if unseen:
-                for callback in nodes[name].callbacks.values() if name in nodes else ():
-                    callback.possible_topics.extend(
-                        t for t in unseen if t not in callback.publishes)
+                drafted = {timer.name: timer}
+                nodes[name] = DraftNode(name, drafted)
+            for each in drafted.values():
+                each.possible_topics.extend(unseen)
         for node in nodes.values():
             self._find_driven(node)
             _find_stores(node)
@@ -222,6 +253,21 @@ class System:
             'it never fired, so it was cancelled, or reset each time before')
         draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
         return draft
+
+    def _keep_declared_topics(self, nodes: dict[str, DraftNode]) -> None:
+        """Keep declared topics that no callback has published: the recording may be too short."""
+        every = {c.key: c for node in nodes.values() for c in node.callbacks.values()}
+        seen = {topic for callback in every.values() for topic in callback.publishes}
+        for declared in self._declared.values():
+            callback = every.get(declared.key)
+            if callback is None:
+                continue
+            for topic in declared.publishes:
+                if topic in seen or topic in callback.publishes:
+                    continue
+                callback.publishes.append(topic)
+                if (callback.runs or 0) > LEAST_SILENT:
+                    callback.sometimes[topic] = 0, callback.runs or 0
 
     def _find_driven(self, node: DraftNode) -> None:
         """
@@ -290,7 +336,7 @@ class System:
         return found
 
     def _paths(self, nodes: dict[str, DraftNode]) -> list[DraftPath]:
-        """Return the declared paths, as far as each step was recorded."""
+        """Return the declared paths without those of which a step was not recorded."""
         every = {c.key: c for node in nodes.values() for c in node.callbacks.values()}
         return [
             DraftPath(path.name, [], list(path.callbacks), {
@@ -341,10 +387,12 @@ class System:
         callback.runs = (callback.runs or 0) + count
         if runs is None or not count:
             return False
+        declared = self._declared.get(entity.number)
         callback.publishes.extend(
             t for t in dict.fromkeys(runs.topics)
-            if t not in callback.publishes and not is_background(t, callback.node)
-            and TOPIC.fits(t))
+            if t not in callback.publishes and TOPIC.fits(t) and (
+                declared is not None and t in declared.publishes
+                or not is_side_output(t, callback.node)))
         callback.possible_topics = [
             t for t in callback.possible_topics if t not in callback.publishes]
         if callback.kind != 'sync':     # each of its messages runs it, and one of them publishes
@@ -352,8 +400,11 @@ class System:
             callback.sometimes.update({
                 topic: (runs.published[topic], count) for topic in callback.publishes
                 if silent.get(topic, 0) > max(LEAST_SILENT, LEAST_SILENT_SHARE * count)})
-        if callback.kind == 'timer' and count == 1 and (
-                self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
+        if entity.number in self._made_again:
+            callback.other_keys['sporadic'] = 'true'
+        elif callback.kind == 'timer' and count == 1 and (
+                'sporadic' not in callback.other_keys
+                and self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
             callback.other_keys['once'] = 'true'
         if callback.kind == 'sync':
             legs = [self._runs[number] for number, declared in self._declared.items()

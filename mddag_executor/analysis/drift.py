@@ -13,7 +13,7 @@ messages did not fit), the declaration is searched for its node and trigger
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Set
+from collections.abc import Mapping, Set
 
 from mddag_executor.recording.joins import different, distinct, rows_by
 from mddag_executor.recording.mapping import declared_keys
@@ -45,7 +45,8 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             of.add(int(mine.min()))
             of.add(int(mine.max()))
             of.count = len(mine)
-            if not recording.run.declared and key in periods:  # skipped releases have no jobs
+            if not (recording.run.declared or dag.sporadic) and key in periods:
+                # skipped releases have no jobs
                 skipped = np.rint(np.diff(np.sort(mine)) / periods[key]) - 1
                 of.count += int(skipped[skipped > 0].sum())
     # declared callbacks that were started, and other executions, a coroutine's once each
@@ -98,4 +99,13 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         max(0, recording.end - recording.run.begin), releases,
         dict(got), dict(ran), came, publishes, set(names.nodes) or None,
         [each.entity for each in names.made
-         if each.entity is not None and each.number not in bound], periods, recording.end))
+         if each.entity is not None and each.number not in bound], periods, recording.end,
+        _blocked(recording, keys)))
+
+
+def _blocked(recording: Recording, keys: Mapping[int, str]) -> set[str]:
+    """Return the declared callbacks that cannot run, as an execution has not ended."""
+    groups, hang = recording.names.groups, set(recording.unfinished['callback'].tolist())
+    busy = {groups.get(each, -1) for each in hang} - {-1}
+    return {key for callback, key in keys.items()
+            if callback in hang or groups.get(callback, -1) in busy}

@@ -24,6 +24,7 @@ from mddag_executor.analysis.causes import (
     CAUSES,
     delayed_by,
     find,
+    HANGS_NS,
     MACHINE,
     MISSED,
     Never,
@@ -146,21 +147,42 @@ class Explanation:
             for thread in distinct(self._place[rows]).tolist()
             for each in [rows[self._place[rows] == thread]]
         } if imported else None
+        hangs, blocked = self._hangs()
         return Pool(
-            {-1: self._busy(rows)} if imported else {
-                place: self._busy(rows[self._place[rows] == place])
+            {-1: self._busy(rows, hangs)} if imported else {
+                place: self._busy(rows[self._place[rows] == place], hangs)
                 for place in {*([0] if one else ()), *distinct(self._place[rows]).tolist()}},
             [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
-            self._place, of_vertex, threads, self._answers())
+            self._place, of_vertex, threads, hangs, blocked, self._answers())
 
-    def _busy(self, rows: Ints) -> Busy:
+    def _hangs(self) -> tuple[Mask, dict[int, Spans]]:
+        """Return which executions never ended, and by vertex when they blocked its group."""
+        table = self._executions
+        found = np.zeros(len(table), dtype=np.bool_)
+        unfinished = self._recording.unfinished
+        if not len(unfinished) or not len(table):
+            return found, {}
+        mine = np.flatnonzero(np.isin(table['start'], unfinished['start']) & (
+            table['end'] - table['start'] >= HANGS_NS))
+        known = set(unfinished[['callback', 'start']].tolist())
+        mine = mine[[key in known for key in table[['callback', 'start']][mine].tolist()]]
+        found[mine] = True
+        group = np.array([self._who.groups.get(each, -1)
+                          for each in table['callback'][mine].tolist()], dtype=np.int64)
+        return found, {vertex: Spans(table['start'][members], table['end'][members])
+                       for vertex, of in self._groups.items() if of >= 0
+                       and len(members := mine[group == of])}
+
+    def _busy(self, rows: Ints, hangs: Mask) -> Busy:
         """Return when executions occupied all workers, and when they may have held the GIL."""
         table = self._executions
         on_workers = rows[table['worker'][rows] >= 0]
         start, end = table['start'][on_workers], table['end'][on_workers]
         # callbacks that ran undeclared may also have held it: a trace does not say
         holding = rows[(table['holds_gil'][rows] & (table['completes'][rows] > 0))
-                       | (table['vertex'][rows] < 0)] if self._recording.run.declared else rows
+                       | (table['vertex'][rows] < 0)
+                       | (hangs & (table['worker'] >= 0))[rows]
+                       ] if self._recording.run.declared else rows
         since, until = table['began'][holding], table['end'][holding]
         return Busy(
             Spans(*crowded(start, end, max(1, self._workers))),

@@ -39,7 +39,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     from mddag_executor.cli.systems import recorded_system, write_declaration
-    from msg_graph import loads
     from msg_graph.draft import accept, declaration_of
     system = recorded_system(*args.trace)
     draft = system.draft()
@@ -48,8 +47,5 @@ def main(args: argparse.Namespace) -> int:
     if not draft.nodes:
         raise InputError(
             system.name, 'none of its callbacks has a known rate', 'record for a longer time')
-    text = declaration_of(draft, args.accept)
-    write_declaration(args.output, text)
-    if args.accept:     # what blanks do not hide, such as a cycle, is an error of the declaration
-        loads(text, '<stdout>' if args.output == '-' else args.output)
+    write_declaration(args.output, declaration_of(draft, args.accept))
     return 0

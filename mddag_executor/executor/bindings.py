@@ -53,6 +53,8 @@ class Bindings:
         self._published: dict[str, set[str]] = {c.key: set() for c in self.declared}
         self._received: dict[str, set[str]] = {c.key: set() for c in self.declared}
         self._undeclared: dict[binding.Entity, None] = {}
+        self._made_when_needed = {
+            c.key for c in self.declared if c.kind == 'timer' and c.sporadic}
         #: The keys of the declared callbacks that have had an entity.
         self._found: set[str] = set()
         # of the warning: when the executor began to judge (monotonic s), and whether it is over
@@ -69,7 +71,8 @@ class Bindings:
         declarable = entity.declarable
         if declarable is None:
             return
-        callback = None if self._binder is None else self._binder.bind(declarable)
+        callback = None if self._binder is None else self._binder.bind(
+            declarable, binding.function_of(entity.symbol))
         if callback is None:
             if not entity.is_own and len(self._undeclared) < REMEMBERED:
                 self._undeclared[declarable] = None
@@ -113,8 +116,11 @@ class Bindings:
     def not_found(self) -> dict[str, str | None]:
         """Return the declared callbacks that never had an entity, each with a question or None."""
         others = self.undeclared()
-        return {each.key: binding.suggest_entity(each, others)
-                for each in self.declared if each.key not in self._found}
+        questions = {each.key: binding.suggest_entity(each, others)
+                     for each in self.declared if each.key not in self._found}
+        # a sporadic timer that was not needed is made by no node
+        return {key: question for key, question in questions.items()
+                if question is not None or key not in self._made_when_needed}
 
     def undeclared(self) -> list[binding.Entity]:
         """Return all undeclared timers, subscriptions and services, including removed ones."""
@@ -156,7 +162,8 @@ class Bindings:
         elsewhere = self.elsewhere(process)
         return [callback for callback in self._binder.unbound()
                 if callback.key not in elsewhere and callback.key not in self._found
-                and not callback.once and not may_run_elsewhere(
+                and not callback.once and callback.key not in self._made_when_needed
+                and not may_run_elsewhere(
                     callback, self._dags.get(callback.key, ()), nodes, self._task_set)]
 
     def unbound_text(

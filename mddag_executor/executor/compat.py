@@ -399,6 +399,15 @@ def awaited(coroutine: Any) -> Any:
     return inner if hasattr(inner, 'add_done_callback') else NEXT_TURN
 
 
+def requested_service(future: Any) -> str:
+    """Return the name of the service whose response a future is; empty: it is another future."""
+    for callback in tuple(getattr(future, '_callbacks', ())):
+        client = getattr(callback, '__self__', None)
+        if isinstance(client, rclpy.client.Client):
+            return service_name(client)
+    return ''
+
+
 # --- executors and nodes -------------------------------------------------------------------------
 
 TASKS_NEWEST_FIRST = TimerInfo is None and not HAS_NEXT_SPIN

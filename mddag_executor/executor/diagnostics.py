@@ -15,7 +15,7 @@ of them, with the sink's name in the key.  Its level is that of the worst sink. 
 been released for a while, and the DAG is neither sporadic nor released only once.  ERROR, WARN:
 see ``Thresholds``.  The pool's status is WARN when data was lost: messages beyond a queue's depth,
 releases of timers, messages whose job was not found, events of the trace, misses for which
-``on_deadline_miss`` was too slow.
+``on_deadline_miss`` was too slow.  It is also WARN while an execution has run for ``LONG_NS``.
 
 By the conventions of diagnostics names are ``NAME: DAG`` and ``NAME: workers``, the hardware_id is
 the host's name and the process, and values are texts with the unit in their keys.
@@ -39,6 +39,7 @@ from mddag_executor.executor.bounds import END_S
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.shutdown import is_over, join, stop_at_exit
+from mddag_executor.executor.unfinished import LONG_NS, unfinished
 from mddag_executor.text import counted
 from rclpy.logging import get_logger
 from rclpy.type_support import check_for_type_support
@@ -55,6 +56,8 @@ TOPIC = '/diagnostics'
 WORKERS = 'workers'
 NODE_NAME = '_mddag_diagnostics'
 OK, WARN, ERROR, STALE = range(4)
+MOST_HANGING = 3
+"""Of more executions that have not ended, the longest ones are named."""
 LEVELS = ('OK', 'WARN', 'ERROR', 'STALE')
 
 
@@ -317,6 +320,10 @@ class PoolWatch:
             ('unattributed', 'messages without a job'), ('trace_lost', 'trace events lost'),
             ('unreported_misses', 'misses not reported to on_deadline_miss'),
         ) if step[key]]
+        until = self._pool.clock.now()
+        hanging = sorted(unfinished(self._pool, until - LONG_NS), key=lambda each: each.since)
+        lost += [f'{each.work.entity.name} has run for {(until - each.since) / 1e9:.0f} s'
+                 + (f' ({each.where})' if each.where else '') for each in hanging[:MOST_HANGING]]
         failed = self._recorder is not None and self._recorder.writer.error is not None
         if failed:
             lost.append('the trace cannot be written')

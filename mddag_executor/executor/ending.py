@@ -23,6 +23,8 @@ import sys
 import threading
 from typing import TYPE_CHECKING
 
+from mddag_executor.executor.unfinished import unfinished
+
 if TYPE_CHECKING:
     from mddag_executor.executor.announcements import Announcements
     from mddag_executor.executor.at_once import AtOnce, SignalPipe
@@ -88,7 +90,7 @@ class Ending:
         with pool.lock:
             now = pool.tick()
             end = min(now, pool.stopped_at or now)
-            pool.engine.finish(now, end)
+            pool.engine.finish(now, end, unfinished(pool))
         if self._recorder is not None:
             self._recorder.close(now, end)
 

@@ -32,7 +32,7 @@ that times never decrease.  The engine and ``other_processes`` change the core's
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
@@ -63,6 +63,7 @@ from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.outer_places import OuterPlaces
 from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.run_records import RunRecords
+from mddag_executor.executor.unfinished import Unfinished
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
 from msg_graph import TaskSet
 
@@ -656,7 +657,7 @@ class Engine:
 
     def begun(self) -> list[Work]:
         """Return the coroutines that have begun, and are suspended or wait to go on."""
-        return [work for work in self._work.values()
+        return [work for work in list(self._work.values())
                 if work.coroutine is not None and self._state.x_started[work.x] >= 0]
 
     def leave_group(self, work: Work) -> None:
@@ -775,6 +776,7 @@ class Engine:
         """Take a running execution off its worker until ``resume``."""
         self._end_bypass()
         work.entity.busy_ns += end - start
+        work.suspended_ns = end
         if self._records is not None:
             self._records.run(work, start, end, vtid, worker, goes_on=True)
         if self.path_watch is not None:
@@ -896,17 +898,26 @@ class Engine:
 
     # --- the end ---------------------------------------------------------------------------------
 
-    def finish(self, now: int, end: int | None = None) -> None:
+    def note_unfinished(self, several: Iterable[Unfinished], now: int) -> None:
+        """Record executions that have not ended, if they are recorded (see ``unfinished``)."""
+        if self._records is not None and not self._finished:
+            self._records.unfinished(several, now)
+
+    def finish(
+        self, now: int, end: int | None = None, unfinished: Iterable[Unfinished] = ()
+    ) -> None:
         """
         Judge open jobs, once, when the run ends.
 
         :param end: when executions stopped starting, if that was before now: running ones have
             ended since, but later deadlines are not judged.
+        :param unfinished: the executions that have not ended.
         """
         end = now if end is None else end
         self._ended = end
         if self._records is not None:
             self._records.waiting(self._work.values(), now)
+            self._records.unfinished(unfinished, now)
         self.scheduler.expire_idle(end)
         self._decided(now)
         self.scheduler.finish(end)

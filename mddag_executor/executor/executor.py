@@ -62,6 +62,7 @@ from mddag_executor.executor.silences import may_be_silent, Silences
 from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.statistics import statistics
 from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, watched
+from mddag_executor.executor.unfinished import LongRuns
 from mddag_executor.executor.upkeep import Upkeep
 from mddag_executor.executor.verdicts import DeadlineMiss
 from mddag_executor.executor.waitables import WaitSetThread
@@ -202,6 +203,8 @@ class MultiDeadlineExecutor(BareExecutor):
             on_miss=None if self._notifier is None else self._notifier.post, process=process)
         try:
             self._pool = WorkerPool(self._engine, self._trace_clock, fail, prepare)
+            if self._recorder is not None:
+                self._recorder.writer.before_write = LongRuns(self._pool).note
             self._at_once = AtOnce(self._pool)
             self._signals = SignalPipe()
             self._at_once.loop.add_own(self._signals)
@@ -786,6 +789,10 @@ class MultiDeadlineExecutor(BareExecutor):
             self._ending.close()
             self._spinning.release()
         return finished and reported
+
+    def abandon_callbacks(self) -> None:
+        """After ``shutdown``, judge open jobs and complete the trace, though callbacks run."""
+        self._ending.end_run()
 
     def begin_end(self) -> None:
         """Ask the executor to end."""

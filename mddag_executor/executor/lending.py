@@ -86,8 +86,12 @@ class Lending:
         self.rejoining: dict[Work, WorkerThread] = {}
 
     @contextmanager
-    def lend(self, me: WorkerThread) -> Iterator[None]:
-        """Lend the worker of a running callback to other threads."""
+    def lend(self, me: WorkerThread, waits_for: str = '') -> Iterator[None]:
+        """
+        Lend the worker of a running callback to other threads.
+
+        :param waits_for: what the callback waits for, in words.
+        """
         pool = self._pool
         lends = False
         if me.work is not None and me.work.coroutine is not None:
@@ -110,13 +114,14 @@ class Lending:
         measurement = me.measurement if lends else None
         if measurement is not None:
             measurement.pause()
-        waits_before, me.waits = me.waits, me.is_out
+        before = me.waits, me.waits_for
+        me.waits, me.waits_for = me.is_out, waits_for
         try:
             executor = pool.executor if me.thread is None else None
             with nullcontext() if executor is None else executor.serve_meanwhile():
                 yield
         finally:
-            me.waits = waits_before
+            me.waits, me.waits_for = before
             if lends and me.thread is not None:
                 self._rejoin(me)
             if measurement is not None:

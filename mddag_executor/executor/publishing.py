@@ -35,7 +35,7 @@ import threading
 from typing import Any
 
 from mddag_executor.executor.attribution import NO_ORIGIN, Publication, PublisherState
-from mddag_executor.executor.compat import GUARD_HANDLE
+from mddag_executor.executor.compat import GUARD_HANDLE, service_name
 from mddag_executor.executor.interrupts import runs_callbacks
 from mddag_executor.executor.listeners import announce_trigger
 from mddag_executor.executor.work import current, Runner
@@ -218,7 +218,7 @@ def install() -> None:
         running = current.running
         if running is None:
             return call(self, request, *args, **kwargs)
-        with running.lend():
+        with running.lend(f'service {service_name(self)}'):
             return call(self, request, *args, **kwargs)
 
     def set_content_filter(self: Any, *args: Any, **kwargs: Any) -> None:

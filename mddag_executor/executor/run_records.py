@@ -12,6 +12,7 @@ from mddag_executor.core import Tables
 from mddag_executor.core.state import ALONE, State, WAITING
 from mddag_executor.executor.attribution import header_stamp, NO_ORIGIN, Origin
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.unfinished import Unfinished
 from mddag_executor.executor.verdicts import Record
 from mddag_executor.executor.work import Work
 from mddag_executor.trace.groups import EXECUTION, PUBLICATION
@@ -100,6 +101,15 @@ class RunRecords:
             if (state.x_state[work.x] in (WAITING, ALONE) and state.x_started[work.x] < 0
                     and work.origin is not None):
                 self.dispatch(work, now, get_native_id(), -1)
+
+    def unfinished(self, several: Iterable[Unfinished], now: int) -> None:
+        """Record executions that have not ended."""
+        for work, vtid, worker, since, where in several:
+            _, dag, job, vertex = work.origin or NO_ORIGIN
+            self._record(
+                'unfinished', now, vtid, work.entity.address, dag,
+                self._tables.index_in_dag[vertex] if dag >= 0 else -1, job, worker,
+                work.ready_ns, since, where)
 
     def judge_from(self, release: int, now: int) -> None:
         """Record from which release on jobs are judged."""

@@ -140,14 +140,21 @@ class Session:
         finish = getattr(self.executor, 'finish_callbacks', None)
         if finish is not None and self._thread.is_alive() and not finish(self.is_patient):
             self.executor.shutdown(0.0)
-            self.clean = False
+            self._abandon()
             return
         # In steps: a signal may shorten the wait meanwhile.
         while self.executor.shutdown(0.1) is False:
             if not self.is_patient():
-                self.clean = False
+                self._abandon()
                 return
         while self._thread.is_alive() and self.is_patient():
             self._thread.join(0.1)
         self._thread.join(0.2)
         self.clean = not self._thread.is_alive()
+
+    def _abandon(self) -> None:
+        """Leave callbacks running that have not ended."""
+        self.clean = False
+        abandon = getattr(self.executor, 'abandon_callbacks', None)
+        if abandon is not None:
+            abandon()

@@ -10,8 +10,10 @@ from mddag_executor.core.tally import counts, never_due
 from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.unfinished import unfinished
 from mddag_executor.executor.workers import WorkerPool
 from mddag_executor.results.runs import CallbackCounts, Statistics
+from mddag_executor.results.sinks import UnfinishedRun
 
 
 def statistics(
@@ -26,7 +28,11 @@ def statistics(
         waiting = engine.queue_length
         idle = engine.idle_workers
         undeclared = engine.undeclared
-        requirements = engine.requirements(pool.clock.now())
+        now = pool.clock.now()
+        requirements = engine.requirements(now)
+        running: list[UnfinishedRun] = [
+            {'callback': each.work.entity.name, 'since_ns': each.since,
+             'for_ns': max(0, now - each.since), 'where': each.where} for each in unfinished(pool)]
         elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
     elsewhere |= registry.bindings.elsewhere(process)
     callbacks = cast('dict[str, CallbackCounts]', registry.counts())
@@ -44,6 +50,7 @@ def statistics(
         'requirements': requirements, 'stops': stops,
         'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
+        'unfinished': running,
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lending.n_lent,
         'unattributed': {
             'unknown': engine.attribution.unknown,

@@ -61,7 +61,7 @@ for _state, _next in (
 class Lending(Protocol):
     """Lends workers: see ``lending.Lending``."""
 
-    def lend(self, me: WorkerThread) -> AbstractContextManager[None]:
+    def lend(self, me: WorkerThread, waits_for: str) -> AbstractContextManager[None]:
         """Lend the worker of a running callback to other threads."""
 
 
@@ -102,6 +102,8 @@ class WorkerThread:
     :ivar has_lent: whether its callback has lent its worker at any time.
     :ivar is_out: whether its callback has no worker now.
     :ivar waits: whether it still waits for the answer for which it lent its worker.
+    :ivar waits_for: what it waits for then; empty: it does not wait, or that is unknown.
+    :ivar since: when the running execution began, on the trace's clock; 0: none runs.
     :ivar measurement: of its running callback; None: it is not measured.
     :ivar paused_ns: for how long the running callback has paused.
     :ivar pause: the pause of the callback that it has just overtaken.
@@ -116,13 +118,14 @@ class WorkerThread:
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
                  'state', 'is_spare', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
-                 'waits_since', 'is_out', 'measurement', 'pause', 'paused_ns', 'name')
+                 'waits_since', 'waits_for', 'is_out', 'measurement', 'pause', 'paused_ns',
+                 'name', 'since')
 
     def __init__(self, pool: Pool, thread: threading.Thread | None) -> None:
         self.pool = pool
         self.engine = pool.engine
         self.thread = thread
-        self.name = 'visitor'
+        self.name, self.waits_for = 'visitor', ''
         self.work: Work | None = None
         self.worker = 0
         self.permit = threading.Lock()
@@ -134,6 +137,7 @@ class WorkerThread:
         self.is_spare = False
         self.state = ThreadState.RUNNING if thread is None else ThreadState.PARKED
         self.published = self.start = self.end = self.waits_since = self.paused_ns = 0
+        self.since = 0
         self.outcome: Any = None
 
     def begin(self) -> None:
@@ -163,15 +167,20 @@ class WorkerThread:
         if not self.published:
             self.published = monotonic_ns()
 
-    def lend(self) -> Any:
-        """Lend the worker while entered: the callback waits for a service, or spins."""
+    def lend(self, waits_for: str = '') -> Any:
+        """
+        Lend the worker while entered: the callback waits for a service, or spins.
+
+        :param waits_for: what it waits for, in words.
+        """
         work = self.work
         group = None if work is None else self.pool.outer_groups.get(work.entity.outer)
-        return self.pool.lending.lend(self) if group is None else self._lend_in(group)
+        lent = self.pool.lending.lend(self, waits_for)
+        return lent if group is None else self._lend_in(group, lent)
 
     @contextmanager
-    def _lend_in(self, group: Any) -> Iterator[None]:
-        with group.nested(), self.pool.lending.lend(self):
+    def _lend_in(self, group: Any, lent: AbstractContextManager[None]) -> Iterator[None]:
+        with group.nested(), lent:
             yield
 
     @property
@@ -195,6 +204,7 @@ class WorkerThread:
         if self.pause is not None:
             self.wait_for_pause()
         start = monotonic_ns()
+        self.since = start + pool.offset
         try:
             if group is not None and work.coroutine is None and (
                     not group.beginning_execution(entity.rclpy_object)):
@@ -202,7 +212,7 @@ class WorkerThread:
             self.outcome = (
                 work.run(must_check) if gate is None else gate(work, must_check))
         except Refused as error:
-            self.outcome = error
+            self.outcome, self.since = error, 0
             return
         except BaseException as error:
             self.outcome = from_user_code(error)
@@ -210,7 +220,7 @@ class WorkerThread:
                 self.outcome is None or isinstance(self.outcome, BaseException)):
             group.ending_execution(entity.rclpy_object)
         end = monotonic_ns()
-        self.start, self.end = start + pool.offset, end + pool.offset
+        self.start, self.end, self.since = self.since, end + pool.offset, 0
         wall = end - start - self.paused_ns
         if measurement is None and wall <= SHORT_CALLBACK_NS >= entity.wall_ns:
             habit.rests -= 1  # an average of short executions stays short without a measurement

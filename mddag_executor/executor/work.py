@@ -48,7 +48,7 @@ class Runner(Protocol):
     def publishes(self, state: Any, msg: Any) -> None:
         """Note that the callback publishes."""
 
-    def lend(self) -> AbstractContextManager[Any]:
+    def lend(self, waits_for: str = '') -> AbstractContextManager[Any]:
         """Lend the worker while entered."""
 
     def is_short(self) -> bool:
@@ -103,6 +103,7 @@ class Work:
     :ivar cpu_ns: its CPU time.
     :ivar coroutine: its ``coroutines.Steps``, if it is one and has begun.
     :ivar paused_ns: for how long it has paused since it was dispatched.
+    :ivar suspended_ns: when its coroutine was suspended last, on the trace's clock; 0: never.
     :ivar yields: how many times in a row its coroutine has yielded without awaiting a future.
     """
 
@@ -113,7 +114,7 @@ class Work:
     published: frozenset[str] = frozenset()
     sent: tuple[tuple[str, int], ...] = ()
     x = worker = -1
-    ready_ns = due_ns = cpu_ns = yields = paused_ns = 0
+    ready_ns = due_ns = cpu_ns = yields = paused_ns = suspended_ns = 0
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),

@@ -682,10 +682,14 @@ class WorkerPool:
             others == 0 or me.is_spare and others < step.n_idle)
         self.become(me, _WAITING if waits else _PARKED)
 
+    def threads(self) -> list[WorkerThread]:
+        """Return all threads that run callbacks, from any thread."""
+        return [*self._threads, *self._visitors]
+
     def thread_of(self, work: Work) -> WorkerThread | None:
         """Return the thread that runs an execution."""
         return next(
-            (each for each in (*self._threads, *self._visitors) if each.work is work), None)
+            (each for each in self.threads() if each.work is work), None)
 
     def cpu_of_resting(self) -> dict[Hashable, int]:
         """Return the CPU times (ns) of the threads that run no callback: see ``GilCheck``."""

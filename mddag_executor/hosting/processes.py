@@ -348,6 +348,7 @@ def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
         'callbacks': callbacks,
         **{key: sum(part[key] for part in parts)
            for key in ('undeclared', 'queue', 'idle_workers', 'lent')},
+        'unfinished': [each for part in parts for each in part['unfinished']],
         'dropped': {name: c['dropped'] for name, c in callbacks.items() if c['dropped']},
         'unattributed': {key: sum(part['unattributed'][key] for part in parts)
                          for key in ('unknown', 'doubtful')},

@@ -67,7 +67,7 @@ def part(
     takes['execution'] = executions.new(takes['execution'])
     takes['message'] = messages.new(takes['message'])
     stops, drops, demotions = columns.stops, columns.drops, columns.demotions
-    losses = columns.losses
+    losses, unfinished = columns.losses, columns.unfinished
     return Columns(
         releases=released[seen[jobs.places(released)]], executions=table,
         publications=sent, takes=takes, job_ends=ends[seen[jobs.places(ends)]],
@@ -75,6 +75,7 @@ def part(
         drops=drops[(drops['time'] >= begin) & (drops['time'] < last)],
         losses=losses[(losses['time'] >= begin) & (losses['time'] < last)],
         demotions=demotions[(demotions['time'] >= begin) & (demotions['time'] < last)],
+        unfinished=unfinished[unfinished['start'] < last],
         misses=columns.misses[judged[jobs.places(columns.misses)]]), until
 
 

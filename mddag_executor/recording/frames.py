@@ -31,6 +31,7 @@ class Words(NamedTuple):
     dags: Sequence[str]
     vertices: Sequence[str]
     drop_reasons: Sequence[str]
+    places: Sequence[str]
     callback: Callable[[int], str]
     publisher: Callable[[int], str]
 
@@ -82,6 +83,8 @@ def _names(words: Words, table: str, column: str, values: Any) -> Any:
     elif column == 'reason':
         names = list(words.drop_reasons if table == 'drops' else REASONS)
         codes = values.astype(np.int32)
+    elif column == 'where':
+        names, codes = list(words.places), values.astype(np.int32)
     elif column == 'completes':
         names, codes = list(_COMPLETES), values
     else:

@@ -42,7 +42,7 @@ from mddag_executor.recording.recording import Recording
 from mddag_executor.text import counted, listed
 from msg_graph import Callback as Declared
 from msg_graph import Dag, EMPTY_TASK_SET, TaskSet, Vertex
-from msg_graph.binding import Binder, entities_of, Entity, suggest_entity
+from msg_graph.binding import Binder, entities_of, Entity, function_of, suggest_entity
 import numpy as np
 
 
@@ -163,17 +163,18 @@ def report_missing(
     absent = [callback for callback in judge.callbacks if callback.key not in found]
     if not absent:
         return []
-    questions = ((c.key, suggest_entity(c, others)) for c in absent)
-    question = next((f'{key}: {each}' for key, each in questions if each is not None), None)
+    questions = {c.key: suggest_entity(c, others) for c in absent}
     if len(absent) == len(judge.callbacks):
         has = f'it has {listed(known)}' if known else 'it does not say what its callbacks are'
         raise ReplayError(
             name, f'none of the callbacks of {judge.file} is in it: {has}',
-            question or 'give the graph of the nodes that were recorded, or none')
+            next((f'{key}: {each}' for key, each in questions.items() if each is not None),
+                 'give the graph of the nodes that were recorded, or none'))
     return [Loss('callbacks', len(absent), (
         f'{name}: not in it: {len(absent)} of the {len(judge.callbacks)} callbacks of '
-        f'{judge.file}, which count as never completed: {listed([c.key for c in absent])}'
-        + ('' if question is None else f': {question}')))]
+        f'{judge.file}, so results that need them are missed or never due: '
+        + listed([key if each is None else f'{key} ({each})'
+                  for key, each in questions.items()])))]
 
 
 class Target(NamedTuple):
@@ -206,7 +207,8 @@ def matches(names: Names, declared: TaskSet) -> dict[int, Target]:
         binder = binders[times[node]]
         times[node] += 1
         for each in callbacks:
-            bound = binder.bind(each.entity) if each.entity and each.number else None
+            bound = binder.bind(each.entity, function_of(each.symbol)) if (
+                each.entity and each.number) else None
             if bound is not None:
                 leg = bound.topics.index(each.start) if each.start in bound.topics else 0
                 found[each.number] = Target(bound, leg, each.start if bound.topics else '')

@@ -102,6 +102,7 @@ class Names:
     :ivar processes: in a recording of another executor by process id a name.
     :ivar workers: names of workers, if they are more than a number.
     :ivar drop_reasons: names of the values of ``drops['reason']``.
+    :ivar places: names of the values of ``unfinished['where']``.
     """
 
     made: list[Callback] = field(default_factory=list)
@@ -115,6 +116,7 @@ class Names:
     processes: Mapping[int, str] = field(default_factory=dict)
     workers: Sequence[str] = ()
     drop_reasons: Sequence[str] = ()
+    places: Sequence[str] = ()
 
     def topic(self, number: int) -> str:
         """Return the topic of a subscription's callback; empty for others."""

@@ -118,6 +118,11 @@ class Recording:
         return self.columns.misses
 
     @property
+    def unfinished(self) -> Table:
+        """Return the executions that had not ended when the recording did."""
+        return self.columns.unfinished
+
+    @property
     def dropped(self) -> Counter[str]:
         """Return the number of dropped executions by reason."""
         counts = np.bincount(self.drops['reason'], minlength=len(self.names.drop_reasons))
@@ -233,5 +238,5 @@ class Recording:
         return frames.Words(
             [dag.name for dag in self.task_set.dags],
             [vertex.name for vertex in self.task_set.vertices], self.names.drop_reasons,
-            self.callback_name, lambda number: publishers[number].topic
+            self.names.places, self.callback_name, lambda number: publishers[number].topic
             if number in publishers else 'unknown')

@@ -16,7 +16,9 @@ Theory of operation
    this row.  So the row that completes a vertex has the values of the whole execution.
 5. ``leg`` is the message of a sync callback that the execution processed; ``ALL_LEGS`` if it
    processed all.  ``completes`` says whether it completed a leg or the vertex.
-6. ``order`` is the position in the sequence in which the executor's core processed releases,
+6. An execution that had not ended when the recording did ends with it, and completes nothing.
+   ``unfinished`` names these, by callback and start.
+7. ``order`` is the position in the sequence in which the executor's core processed releases,
    completions and ends of jobs.  It decides between equal times.
 """
 
@@ -62,11 +64,12 @@ LOSSES = _table(process='i2', callback='i8', time='i8', count='i8')
 DEMOTIONS = _table(process='i2', dag='i4', vertex='i4', job='i8', time='i8')
 MISSES = _table(dag='i4', vertex='i4', job='i8', deadline='i8', completed='i8')
 STOPS = _table(process='i2', start='i8', end='i8')
+UNFINISHED = _table(process='i2', callback='i8', start='i8', where='i2')
 
 TABLES = {
     'releases': RELEASES, 'executions': EXECUTIONS, 'publications': PUBLICATIONS,
     'job_ends': JOB_ENDS, 'stops': STOPS, 'takes': TAKES, 'drops': DROPS,
-    'losses': LOSSES, 'demotions': DEMOTIONS, 'misses': MISSES}
+    'losses': LOSSES, 'demotions': DEMOTIONS, 'misses': MISSES, 'unfinished': UNFINISHED}
 """The tables of a recording with the types of their columns."""
 
 
@@ -88,6 +91,7 @@ class Columns:
     losses: Table = _empty('losses')
     demotions: Table = _empty('demotions')
     misses: Table = _empty('misses')
+    unfinished: Table = _empty('unfinished')
 
     def __post_init__(self) -> None:
         for each in fields(self):

@@ -16,6 +16,7 @@ from mddag_executor.report.tables import (
     percent,
     requirement_table,
     sink_table,
+    unfinished_lines,
     verdicts_line,
 )
 from mddag_executor.report.text import listed, printable
@@ -40,6 +41,7 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
         yield (f'{stops["misses"]} of {total(result["dags"]).missed} misses '
                f'are due to {counted(stops["count"], "stop")} ({stops["total_ns"] / 1e9:.2f} s), '
                'in which no thread of this process ran')
+    yield from unfinished_lines(result['unfinished'])
     yield from never_due_lines(result['dags'])
     if 'processes' in result:
         yield from _absent(result['dags'])

@@ -15,6 +15,7 @@ from mddag_executor.report.tables import (
     run_lines,
     short_names,
     times,
+    unfinished_lines,
     with_means,
     worst_first,
 )
@@ -133,6 +134,7 @@ def paths_rows(paths: Mapping[str, Any]) -> Iterator[list[Cell]]:
 
 def summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines below the tables of a replay."""
+    yield from unfinished_lines(result.get('unfinished', ()))
     if result['skip_ns']:
         yield f'left out: jobs released in the first {format_ns(result["skip_ns"])}' + (
             '' if result['skip_ns'] < result['duration_ns'] else

@@ -216,12 +216,28 @@ def never_due_lines(dags: Mapping[str, Any]) -> Iterator[str]:
         yield f'never due, so not judged: {counted(len(never), "sink")}: {listed(never)}'
 
 
+LONG_NS = 1_000_000_000
+"""Executions that had run for less when the run ended are not worth a line."""
+
+
 def guessed_lines(guessed: Mapping[str, int]) -> Iterator[str]:
     """Yield a line about results of syncs of two rates that may belong to another job, if any."""
     if guessed:
         yield (f'{counted(sum(guessed.values()), "result")} of a sync with driven_by counted for '
                'the newest of several messages that waited, as no header stamp says which one was '
                'used: ' + listed([f'{name} {n}' for name, n in guessed.items()]))
+
+
+def unfinished_lines(unfinished: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield a line for each callback that has not ended for long, the longest first."""
+    hangs = sorted((each for each in unfinished if each['for_ns'] >= LONG_NS),
+                   key=lambda each: -each['for_ns'])
+    for each in hangs[:MOST_LINES]:
+        where = f' ({each["where"]})' if each['where'] else ''
+        yield printable(f'{each["callback"]} has not ended: it has run for '
+                        f'{each["for_ns"] / 1e9:.1f} s{where}')
+    if len(hangs) > MOST_LINES:
+        yield f'{len(hangs) - MOST_LINES} more executions have not ended'
 
 
 def run_lines(result: Mapping[str, Any], more: str = '') -> Iterator[str]:

@@ -12,6 +12,7 @@ from mddag_executor.results.sinks import (
     Requirements,
     SinkCounts,
     SlackTimes,
+    UnfinishedRun,
     Verdicts,
 )
 
@@ -317,6 +318,8 @@ class DriftResult(TypedDict):
 class ReplayResultRare(TypedDict, total=False):
     """Keys that only some replays have."""
 
+    unfinished: list[UnfinishedRun]
+    """Only if there are any: executions that had not ended when the recording did."""
     guessed: dict[str, int]
     """Only if there are any: by sync with `driven_by` the results for which it is not known which
     of several messages was used; the newest one counts."""

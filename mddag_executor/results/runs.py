@@ -14,6 +14,7 @@ from mddag_executor.results.sinks import (
     Requirements,
     ResponseTimes,
     SinkCounts,
+    UnfinishedRun,
 )
 
 
@@ -121,6 +122,8 @@ class ExecutorState(TypedDict):
     """Executions of undeclared callbacks."""
     dropped: dict[str, int]
     """By callback how many messages or releases did not run, if any."""
+    unfinished: list[UnfinishedRun]
+    """Executions that have not ended: that run, or are suspended."""
     queue: int
     """Ready executions that wait."""
     idle_workers: int

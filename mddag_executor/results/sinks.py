@@ -131,6 +131,19 @@ class DagCounts(TypedDict):
     """By name of the sink its results."""
 
 
+class UnfinishedRun(TypedDict):
+    """An execution that has not ended."""
+
+    callback: str
+    """Its callback."""
+    since_ns: int
+    """When it began, ns since the epoch; of a suspended coroutine, since when it waits."""
+    for_ns: int
+    """How long ago that was."""
+    where: str
+    """The line of the program that it had reached, and what it waits for; empty if unknown."""
+
+
 class FirstMiss(TypedDict):
     """The missed deadline that came first."""
 

@@ -11,19 +11,23 @@ Theory of operation
 2. A dispatch is a row.  Each other event belongs to the last dispatch of its thread, in the order
    of the file.  The first end of the dispatched callback ends the execution.
 3. A ``complete`` completes an ended execution of the same DAG, vertex and job.  Otherwise it is a
-   row without start.  A dispatch without end is a row without end: it ran at the end of the run,
-   or waited (then its worker is -1, its start the run's end).
+   row without start.  A dispatch without end is a row without end: it waited at the end of the
+   run (its worker is -1, its start the run's end).
 4. Events come in batches.  Completions of the newest row of a thread wait for the next batch,
    which may have those of other legs.
 5. Rows with the same vertex, job and ready time, up to the completing one, are pieces of one
    execution, in the order of their starts.  Executions of an undeclared callback may have been
    ready at the same time (in virtual time), so a piece that was suspended says so: ``GOES_ON``.
+6. ``unfinished`` is recorded of an execution that has run for long, or runs at the end of the run,
+   and of a suspended coroutine, since when it waits.  If it was not dispatched with the same start
+   (the coroutine: not again), it has not ended: it is a row that ends with the recording.  The
+   last of several events counts.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from mddag_executor.core import legs_of
@@ -38,7 +42,17 @@ from mddag_executor.recording.joins import (
     rows_by,
     sort_by,
 )
-from mddag_executor.recording.tables import ALL_LEGS, EXECUTIONS, LEG, NOTHING, UNKNOWN, VERTEX
+from mddag_executor.recording.tables import (
+    ALL_LEGS,
+    EXECUTIONS,
+    LEG,
+    NOTHING,
+    UNFINISHED,
+    UNKNOWN,
+    VERTEX,
+)
+from mddag_executor.sources.entities import signed
+from mddag_executor.trace.events import Event
 from mddag_executor.trace.schema import GOES_ON
 from msg_graph import TaskSet
 import numpy as np
@@ -171,6 +185,38 @@ class ExecutionJoin:
         _pieces(table)
         return table, self._completed.table()
 
+    def add_unfinished(self, several: Iterable[Event], end: int) -> list[Event]:
+        """
+        Add executions that have not ended (rule 6).
+
+        :param several: events in the order of the file; ``end``: of the recording.
+        :return: the events of those that were added.
+        """
+        self.add({}, at_end=True)
+        last = {(event[3], signed(event[4]), event[10]): event for event in several
+                if 0 < event[10] < end}
+        if not last:
+            return []
+        table = self._executions.rows()
+        mine = np.isin(table['callback'], [callback for _, callback, _ in last])
+        dispatched = set(table[['thread', 'callback', 'start']][mine].tolist())
+        resumed: dict[tuple[int, int], int] = {}    # by callback and ready time the last start
+        if any(not thread for thread, _, _ in last):
+            for callback, ready, start in table[['callback', 'ready', 'start']][mine].tolist():
+                resumed[callback, ready] = max(start, resumed.get((callback, ready), 0))
+        found = {
+            key: event for key, event in last.items() if key not in dispatched and (
+                key[0] or resumed.get((key[1], event[9]), 0) < key[2])}
+        for (thread, callback, start), event in found.items():
+            _, _, _, _, _, dag, vertex, job, worker, ready, _, _ = event
+            dag, vertex = (int(each[0]) for each in self._numbering.of(
+                np.array([dag]), np.array([vertex])))
+            self._executions.more(
+                1, callback=callback, dag=dag, vertex=vertex, job=job if vertex >= 0 else UNKNOWN,
+                worker=worker, thread=thread, ready=min(max(0, ready), start), began=start,
+                start=start, end=end, busy=end - start)
+        return [*found.values()]
+
     def add(
         self, parts: Mapping[str, Sequence[tuple[Table, Ints]]], at_end: bool = False
     ) -> None:
@@ -271,6 +317,14 @@ class ExecutionJoin:
         table['completes'][row] = np.where(complete['last_leg'][event], VERTEX, LEG)
         self._completed.add(rows(
             COMPLETED, len(row), place=complete.place[event], time=time[which], row=row))
+
+
+def unfinished_rows(several: Sequence[tuple[int, int, str]]) -> tuple[Table, Sequence[str]]:
+    """Return unfinished executions, given by callback, start and place, and the places' names."""
+    places = list(dict.fromkeys(place for _, _, place in several))
+    callback, start, where = zip(*several) if several else ((), (), ())
+    return rows(UNFINISHED, len(several), callback=callback, start=start,
+                where=[places.index(each) for each in where]), tuple(places)
 
 
 def _pieces(table: Table) -> None:

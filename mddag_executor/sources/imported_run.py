@@ -18,7 +18,8 @@ Executions are linked with messages (``links``), and assigned to jobs (``importe
    uses another clock), the release is the start; a warning reports it. A subscription or service
    without publisher in the graph is released as declared: by header stamp, source timestamp, or
    the time at which its message was taken.
-2. *Ready* is a timer's release, otherwise the source timestamp (within a process: the
+2. An execution has not ended if nothing followed it in its thread until the recording ended.
+3. *Ready* is a timer's release, otherwise the source timestamp (within a process: the
    publication). Arrival at the reader is not recorded, so transport counts as waiting.
 """
 
@@ -41,9 +42,17 @@ from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import Columns, EXECUTIONS, PUBLICATIONS, TAKES, UNKNOWN
 from mddag_executor.sources.entities import Entities, INIT_EVENTS
+from mddag_executor.sources.executions import unfinished_rows
 from mddag_executor.sources.head import damage, named_errors, no_jobs, no_run
 from mddag_executor.sources.imported_clocks import ImportedClocks
-from mddag_executor.sources.imported_events import KINDS, moved, read_events, START
+from mddag_executor.sources.imported_events import (
+    END,
+    Events,
+    KINDS,
+    moved,
+    read_events,
+    START,
+)
 from mddag_executor.sources.imported_jobs import ImportedJobs
 from mddag_executor.sources.links import Links, Oddities
 from mddag_executor.text import counted, listed
@@ -53,6 +62,8 @@ from mddag_executor.trace.times import credible
 from msg_graph import Process, TaskSet
 import numpy as np
 
+LEAST_UNFINISHED_NS = 1_000_000_000
+"""An execution whose end is not recorded, so long before that of the recording, has not ended."""
 _SLACK_NS = 1_000_000
 _OWN = ('mddag:job_release', 'mddag:dispatch')
 OFF_THE_GRID = {
@@ -84,8 +95,8 @@ class ImportedRun:
         self._reader = reader
         self.name = name
         with named_errors(reader.path, name):
-            self._events = read_events(
-                reader, self.kinds, self.others, progress)
+            self._events = self._with_unfinished(read_events(
+                reader, self.kinds, self.others, progress))
         give_back()     # memory of the batches
         starts = self._starts()
         # this executor recorded it, but its executions are lost
@@ -112,8 +123,7 @@ class ImportedRun:
         self._vertex = {number: vertices[target.callback.key]
                         for number, target in self._targets.items()}
         #: The last event's time, ns.
-        self.end = max(min(max(0, self.head.time), NEVER - 1),
-                       int(self._events.table['time'].max(initial=0)))
+        self.end = max(min(max(0, self.head.time), NEVER - 1), *self._last_times())
         self._odd = Oddities(self.odd, 5)
         self._fallbacks: Counter[str] = Counter()
 
@@ -139,12 +149,14 @@ class ImportedRun:
         table['ready'], release = self._times(jobs)
         jobs.fill(table, release, last)
         self._number_pieces(table)
+        unfinished, places = self._end_unfinished(table)
         run = Run(
             self.name, self.head, self.task_set, self.task_set, declared=False,
             imported=self._imported, same=False,
             start=earliest(table['ready'], jobs.releases['release']), end=self.end,
             judged_until=self._judged_until(), workers_each=self.head.workers, links=True)
-        names = replace(self.who.names, vertices=self._vertex, workers=self._worker_names())
+        names = replace(self.who.names, vertices=self._vertex, workers=self._worker_names(),
+                        places=places)
         if self._imported:
             processes = dict(zip(self._pids, process_names(self._pids, self._events.names)))
             names = replace(names, processes=processes)
@@ -152,8 +164,52 @@ class ImportedRun:
                 run, placed=self._placed(processes), workers_each=self._workers_each())
         found = self._completed(Recording(run, Columns(
             releases=jobs.releases, executions=table, publications=self._publications(),
-            job_ends=jobs.ends, takes=self._takes()), names))
+            job_ends=jobs.ends, takes=self._takes(), unfinished=unfinished), names))
         return replace(found, missing=Losses(self._missing(found)))
+
+    def _last_times(self) -> Iterator[int]:
+        """Yield times at which it still ran."""
+        yield int(self._events.table['time'].max(initial=0))
+
+    def _with_unfinished(self, events: Events) -> Events:
+        """Return the events with the starts of executions that only other events show."""
+        return events
+
+    def _have_workers(self, mine: Ints) -> list[bool]:
+        """Return which executions that have not ended kept their workers."""
+        return [True] * len(mine)
+
+    def _places(self, mine: Ints) -> list[str]:
+        """Return where executions were that have not ended."""
+        return [''] * len(mine)
+
+    def _end_unfinished(self, table: Table) -> tuple[Table, Sequence[str]]:
+        """
+        Let executions that have run for ``LEAST_UNFINISHED_NS`` and not ended end with the run.
+
+        An execution has not ended if nothing else began or ended in its thread after its start.
+
+        :return: these, and where they were.
+        """
+        events, runs = self._events.table, self.links.runs
+        pids = np.array([pid for pid, _ in self._events.threads], dtype=np.int64)
+        ends = np.zeros(len(events), dtype=np.int64)    # by process its last event
+        _, process = different(pids)
+        np.maximum.at(ends, process[events['thread']], events['time'])
+        at = np.flatnonzero(events['kind'] <= END)
+        last = np.full(len(pids), UNKNOWN)      # by thread its last start or end
+        last[events['thread'][at]] = at
+        end = ends[process[runs['thread']]] if self._imported else np.full(len(runs), self.end)
+        mine = np.flatnonzero((runs['end_at'] < 0) & (last[runs['thread']] == runs['at']) & (
+            end - runs['start'] >= LEAST_UNFINISHED_NS))
+        table['end'][mine] = end[mine]
+        table['busy'][mine] = end[mine] - runs['start'][mine]
+        workers = {each: number for number, each in enumerate(self._workers)}
+        table['worker'][mine] = [
+            workers.get(self._events.threads[thread], UNKNOWN) if has_worker else UNKNOWN
+            for thread, has_worker in zip(runs['thread'][mine].tolist(), self._have_workers(mine))]
+        return unfinished_rows([*zip(
+            table['callback'][mine].tolist(), table['start'][mine].tolist(), self._places(mine))])
 
     def _number_pieces(self, table: Table) -> None:
         """Do nothing: each execution has one piece."""

@@ -67,7 +67,7 @@ _TIMES = {
     'releases': ('release', 'noticed'), 'executions': ('ready', 'began', 'start', 'end'),
     'publications': ('time', 'source_timestamp'), 'job_ends': ('time',),
     'drops': ('time',), 'losses': ('time',), 'demotions': ('time',),
-    'misses': ('deadline', 'completed'), 'stops': ('start', 'end')}
+    'misses': ('deadline', 'completed'), 'stops': ('start', 'end'), 'unfinished': ('start',)}
 _HAPPENED = {
     'releases': 'noticed', 'executions': 'end', 'publications': 'time', 'job_ends': 'time',
     'drops': 'time', 'demotions': 'time', 'stops': 'end'}
@@ -147,7 +147,7 @@ class _Part:
                     found.run, notices_stops=found.run.notices_stops + self.shift)
         for addresses in (
                 tables['executions']['callback'], tables['losses']['callback'],
-                tables['publications']['publisher']):
+                tables['unfinished']['callback'], tables['publications']['publisher']):
             addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
         worker = tables['executions']['worker']
         # other threads, with higher numbers, lent themselves
@@ -314,7 +314,7 @@ class Joined:
         head = self.head._replace(
             time=min(part.first for part in self._parts), workers=self._workers)
         ranks = self._ranks()
-        tables, reasons = self._join(ranks, rows)
+        tables, reasons, places = self._join(ranks, rows)
         run = self._with_end(Run(
             self.name, head, self.task_set, self.task_set, same=False,
             processes=len(self._parts), placed=self._placed(),
@@ -325,7 +325,7 @@ class Joined:
         lost = sum(part.found.lost for part in self._parts)
         return Recording(
             run, Columns(**tables), replace(
-                who.names, drop_reasons=reasons,
+                who.names, drop_reasons=reasons, places=places,
                 # the last word of the trace's name
                 workers=[f'{part.label} {worker}' for part in self._parts
                          for worker in range(part.head.workers)]),
@@ -334,15 +334,16 @@ class Joined:
 
     def _join(
         self, ranks: Sequence[Ints], rows: Sequence[RowNumbers]
-    ) -> tuple[dict[str, Table], Sequence[str]]:
+    ) -> tuple[dict[str, Table], Sequence[str], Sequence[str]]:
         """
-        Return the merged tables of all traces, and the reasons of drops.
+        Return the merged tables of all traces, the reasons of drops, and the unfinished's places.
 
         :param rows: by part the new numbers of executions.
         """
         parts = self._parts
         before = 0
         reasons: dict[str, int] = {}
+        places: dict[str, int] = {}
         for part, rank in zip(parts, ranks):
             of = part.found.tables
             by = rows[part.place].new(of['publications']['execution'])
@@ -351,10 +352,11 @@ class Joined:
             for table in (of['releases'], of['executions'], of['job_ends']):
                 known = table['order'] >= 0
                 table['order'][known] = rank[table['order'][known]]
-            numbers = np.array([
-                reasons.setdefault(reason, len(reasons))
-                for reason in part.found.drop_reasons] or [0])
-            of['drops']['reason'] = numbers[of['drops']['reason']]
+            for column, numbers, names in (
+                    (of['drops']['reason'], reasons, part.found.drop_reasons),
+                    (of['unfinished']['where'], places, part.found.places)):
+                column[:] = np.array([
+                    numbers.setdefault(each, len(numbers)) for each in names] or [0])[column]
             for table in of.values():
                 if 'process' in table.names:
                     table['process'] = part.place
@@ -363,7 +365,7 @@ class Joined:
             found[name] = concatenate([part.found.tables.pop(name) for part in parts])
         for name, column in (('releases', 'order'), ('publications', 'time')):
             found[name] = found[name][sort_by(found[name][column])]
-        return found, tuple(reasons)
+        return found, tuple(reasons), tuple(places)
 
     def _ranks(self) -> list[Ints]:
         """Return by part the joined positions of its positions in the order; 0 is before all."""

@@ -56,6 +56,7 @@ from mddag_executor.sources.executions import (
     Numbering,
     PARTS,
     running_at,
+    unfinished_rows,
 )
 from mddag_executor.sources.head import (
     damage,
@@ -73,10 +74,10 @@ import numpy as np
 
 _PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
 (_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
- _JUDGE_FROM, _MESSAGES_LOST) = (
+ _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED) = (
     f'mddag:{name}' for name in (
         'deadline', 'demote', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop',
-        'hosted', 'shutdown', 'judge_from', 'messages_lost'))
+        'hosted', 'shutdown', 'judge_from', 'messages_lost', 'unfinished'))
 _FIELDS = {
     DISPATCH: 'vtid callback dag vertex job worker ready',
     END: 'vtid callback',
@@ -119,7 +120,8 @@ def read_own(
     executions.replace('message', np.broadcast_to(np.int32(UNKNOWN), len(executions)))
     give_back()     # events that are in no table
     return Recording(
-        read.run, Columns(**read.tables), replace(who.names, drop_reasons=read.drop_reasons),
+        read.run, Columns(**read.tables), replace(
+            who.names, drop_reasons=read.drop_reasons, places=read.places),
         Losses((*read.losses, *end_losses(read.run, len(read.tables['releases']), read.lost))))
 
 
@@ -167,6 +169,7 @@ class Read:
     run: Run
     tables: dict[str, Table]
     drop_reasons: Sequence[str]
+    places: Sequence[str]
     lost: int
     losses: Sequence[Loss]
     seen_at: Ints
@@ -187,13 +190,13 @@ class _Source:
         self._who = who
         # rows of the other events
         self._kinds = {name: Growing(kind) for name, kind in _ROWS.items() if name not in PARTS}
-        self._last_seen = 0
+        self._last_seen = self._latest = 0
         self._others: list[tuple[int, Event]] = []
 
     def read(self, progress: Progress | None) -> Read:
         count = 0
         for batch in self._reader.batches({
-                *_ROWS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED}):
+                *_ROWS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED, _UNFINISHED}):
             self._take(batch)
             count += batch.n_events
             if progress is not None:
@@ -205,6 +208,9 @@ class _Source:
 
     def _take(self, batch: Batch) -> None:
         """Store the events of a batch, executions as rows."""
+        self._latest = max(self._latest, *(
+            int(table['timestamp'].max(initial=0)) for _, table, _ in batch.tables), *(
+            event[1] or 0 for _, event in batch.others), 0)
         parts: dict[str, list[tuple[Table, Ints]]] = {}
         for (name, *_), table, places in batch.tables:
             if name in _ROWS:
@@ -235,8 +241,9 @@ class _Source:
 
     def _read(self) -> Read:
         self._entities()
+        unfinished, places = self._unfinished()
         executions, completed = self._executions.tables()
-        self._last_seen = self._executions.last
+        self._last_seen = max(self._last_seen, self._executions.last)
         publications = self._publications(executions, completed)
         releases, released_at = self._releases(self._pop(_RELEASE))
         job_ends, ends_at = self._job_ends()
@@ -261,8 +268,8 @@ class _Source:
         return Read(run, {
             'releases': releases, 'executions': executions, 'publications': publications,
             'job_ends': job_ends, 'misses': misses, 'demotions': demotions, 'losses': losses,
-            'stops': stops, 'drops': drops, 'takes': rows(TAKES)},
-            reasons, lost, self._doubts(), times[in_order])
+            'stops': stops, 'drops': drops, 'takes': rows(TAKES), 'unfinished': unfinished},
+            reasons, places, lost, self._doubts(), times[in_order])
 
     def _entities(self) -> None:
         self._others.sort(key=lambda each: each[0])
@@ -271,6 +278,14 @@ class _Source:
                 self._who.take(event if self._edit is None else self._edit(event))
             elif event[0] == TASK_SET and event[4] != self._head.yaml:
                 self._strange[f'{TASK_SET} with another declaration'] += 1
+
+    def _unfinished(self) -> tuple[Table, Sequence[str]]:
+        """Add the executions that have not ended; return them, and where they were."""
+        several = [event for _, event in self._others if event[0] == _UNFINISHED]
+        self._last_seen = max([self._last_seen, *(event[1] for event in several)])
+        added = self._executions.add_unfinished(several, min(self._latest, NEVER - 1))
+        return unfinished_rows(
+            [(signed(event[4]), event[10], event[11]) for event in added])
 
     def _publications(self, executions: Table, completed: Table) -> Table:
         published = self._pop(_PUBLISH)

@@ -25,6 +25,8 @@ the causes of executions.  Differences:
    was noticed.
 4. The pieces of a coroutine became ready at the same time.  They are one execution, which
    completes at the end of the last piece.
+5. The start of an execution is recorded when it ends.  That of one that has not ended is in
+   ``unfinished``.
 """
 
 from __future__ import annotations
@@ -32,16 +34,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from mddag_executor.recording.columns import Ints, Mask, rows, Table
+from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
 from mddag_executor.recording.joins import as_of, distinct, equal_pairs, rows_by, sort_by
 from mddag_executor.recording.losses import Loss
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, UNKNOWN
-from mddag_executor.sources.entities import INIT_EVENTS
+from mddag_executor.sources.entities import INIT_EVENTS, signed
 from mddag_executor.sources.executions import number_pieces
 from mddag_executor.sources.head import no_end
 from mddag_executor.sources.imported_events import (
     END,
+    Events,
     KINDS,
     OWN_KINDS,
     READY,
@@ -56,7 +59,8 @@ from mddag_executor.sources.stamps import find_stamps, Sent
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
-_DROP, _MESSAGES_LOST = 'mddag:drop', 'mddag:messages_lost'
+_DROP, _MESSAGES_LOST, _UNFINISHED = (
+    'mddag:drop', 'mddag:messages_lost', 'mddag:unfinished')
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
 # One in this many releases may exclude the origin of the grid, and one has to exclude others.
@@ -140,13 +144,56 @@ class UndeclaredRun(ImportedRun):
     """A run of this executor that was recorded without a declaration."""
 
     kinds = {**KINDS, **OWN_KINDS}
-    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST)
+    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED)
     links_type = _OwnLinks
     odd = {**OFF_THE_GRID, 'off': (
         'execution', 'of timers whose due times are not recorded and that kept to no period '
         '(reset, or by another clock): released when they were noticed'), 'skipped': (
         'release', 'of timers skipped, as the one before began later than they were due: without '
         'a job, so they do not count as missed')}
+
+    def _with_unfinished(self, events: Events) -> Events:
+        """Add the starts of executions that have not ended (rule 5)."""
+        starts, ready = (events.table[events.table['kind'] == kind] for kind in (START, READY))
+        begun = set(starts[['thread', 'a', 'time']].tolist())
+        resumed = {(callback, ready): time for time, callback, ready in ready[
+            ['time', 'a', 'b']].tolist()}   # by callback and ready time the last dispatch
+        threads = {each: number for number, each in enumerate(events.threads)}
+        found: dict[tuple[int, int, int], tuple[int, int, str]] = {}
+        for event in events.others:
+            layout, _, pid, tid, *values = event
+            fields = dict(zip(layout.fields, values))
+            if layout.name == _UNFINISHED and 0 < fields.get('start', 0) < NEVER:
+                thread = threads.setdefault((pid, tid), len(threads))
+                key = thread, signed(fields.get('callback', 0)), fields['start']
+                if key not in begun and (tid or resumed.get(
+                        (key[1], fields.get('ready', 0)), 0) < fields['start']):
+                    found[key] = (fields.get('ready', 0), fields.get('worker', UNKNOWN),
+                                  str(fields.get('where', '')))
+        #: By thread, address and start of an unfinished execution: ready, worker, where it was.
+        self._found = found
+        table = concatenate([events.table, *(
+            rows(events.table.dtype, 2, time=start, place=0, thread=thread, kind=(READY, START),
+                 a=callback, b=(ready, 0))
+            for (thread, callback, start), (ready, *_) in found.items())])
+        return events._replace(
+            table=table[sort_by(table['time'], table['place'])], threads=[*threads])
+
+    def _last_times(self) -> Iterator[int]:
+        yield from super()._last_times()
+        yield from (event[1] for event in self._events.others if event[0].name == _UNFINISHED)
+
+    def _unfinished(self, mine: Ints) -> list[tuple[int, int, str]]:
+        runs, table = self.links.runs, self._events.table
+        keys = zip(runs['thread'][mine].tolist(), table['a'][runs['at'][mine]].tolist(),
+                   runs['start'][mine].tolist())
+        return [self._found.get(key, (0, UNKNOWN, '')) for key in keys]
+
+    def _have_workers(self, mine: Ints) -> list[bool]:
+        return [worker >= 0 for _, worker, _ in self._unfinished(mine)]
+
+    def _places(self, mine: Ints) -> list[str]:
+        return [where for _, _, where in self._unfinished(mine)]
 
     def _number_pieces(self, table: Table) -> None:
         number_pieces(table, np.arange(len(table)), 'callback', table['completes'] == NOTHING)

@@ -149,6 +149,10 @@ _ALL = (
     # the due time of a timer that belongs to no job, 0: unknown
     _event('mddag', 'dispatch', (0,), callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
            ready=_I64, reference_deadline=_I64, due=_I64),
+    # an execution that has not ended: when it began, where it is and what it waits for, in words;
+    # of a suspended coroutine without a thread, since when it waits
+    _event('mddag', 'unfinished', callback=_U64, dag=_I32, vertex=_I32, job=_I64, worker=_I32,
+           ready=_I64, start=_I64, where=_STR),
     # the CPU time of the execution, -1: unknown, and whether it held the GIL
     _event('mddag', 'complete', (-1, False),
            callback=_U64, dag=_I32, vertex=_I32, job=_I64, last_leg=_BOOL, completed=_I64,

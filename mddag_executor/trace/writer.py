@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import atexit
 from collections import deque
+from collections.abc import Callable
 import logging
 import os
 import threading
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
 _LOGGER = logging.getLogger(__name__)
 _SLICE = 128            # events encoded at once: about 0.2 ms
 _NAP_S = 50e-6          # long enough for a waiting thread to get the GIL
+
+
+def _nothing() -> None:
+    pass
 
 
 class TraceWriter:
@@ -58,6 +63,8 @@ class TraceWriter:
         """
         #: Offset from `time.monotonic_ns()` to the trace's clock.
         self.clock_offset = clock_offset
+        #: Called by the writer thread each time before it writes; it may record.
+        self.before_write: Callable[[], None] = _nothing
         #: Why recording ended early; None: no error.
         self.error: TraceError | None = None
         self._file = TraceFile(path, overwrite=overwrite)
@@ -142,6 +149,7 @@ class TraceWriter:
     def _run(self) -> None:
         try:
             while not self._stop.wait(self._interval_s):
+                self.before_write()
                 self._drain()
                 self._file.flush()
             self._drain()

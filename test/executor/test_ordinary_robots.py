@@ -5,14 +5,17 @@
 from contextlib import contextmanager
 from functools import partial
 from itertools import count
+from random import Random
 import time
 
 from mddag_executor import replay, reschedule
 from mddag_executor.analysis.drafting import System
+from mddag_executor.errors import InputError
 from mddag_executor.executor import current_job
 from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.replays import summary
-from msg_graph import loads
+from mddag_executor.trace import TraceFile, TraceReader
+from msg_graph import GraphError, loads
 from msg_graph.draft import accept, declaration_of
 import pytest
 from std_msgs.msg import Header
@@ -400,3 +403,125 @@ def test_the_draft_of_a_run_without_declaration_knows_the_patterns(
     found = verdicts(replay(path, drafted).result())
     for name, (completed, _, late, expired) in found.items():
         assert (completed > 0, late, expired) == (True, 0, 0), name
+
+
+MADE_AGAIN = graph(
+    dock="""
+        name: begin, timer: 50ms, deadline: 5s, dag: begin
+        name: give_up, timer: 11ms, sporadic: true, deadline: 4s, dag: give_up
+        name: retry, timer: 11ms, sporadic: true, deadline: 3s, dag: retry""")
+
+
+class Dock:
+    """Makes timers of one period in each step, each of which cancels itself or is destroyed."""
+
+    def __init__(self, make_node):
+        self.node = make_node('dock')
+        self.fired = []
+        self.step, self.timers = 0, []
+        self.node.create_timer(0.05, self.begin)
+
+    def begin(self):
+        self.step += 1
+        if self.step < 10:
+            self.timers.append(self.node.create_timer(
+                0.011, self.retry if self.step % 3 else self.give_up))
+
+    def give_up(self):
+        self.fired.append('give_up')
+        self.timers.pop(0).cancel()
+
+    def retry(self):
+        self.fired.append('retry')
+        timer = self.timers.pop(0)
+        timer.cancel()
+        self.node.destroy_timer(timer)
+
+
+@pytest.mark.parametrize('declared', [True, False], ids=['declared', 'undeclared'])
+def test_a_timer_that_is_made_when_it_is_needed(make_executor, make_node, tmp_path, declared):
+    """Each time that it fires is a job of its callback, live, as recorded, and in a draft."""
+    path = tmp_path / 'run.mcap'
+    robot = Dock(make_node)
+    executor = make_executor(loads(MADE_AGAIN) if declared else None, trace=str(path))
+    executor.add_node(robot.node)
+    with Spinning(executor):
+        assert wait_for(lambda: robot.step > 12, 30)
+    expected = {name: robot.fired.count(name) for name in ('give_up', 'retry')}
+    assert sum(expected.values()) > 5 and min(expected.values()) > 1
+    draft = System(path).draft()
+    accept(draft)
+    text = declaration_of(draft, accepted=True)
+    drafted = {callback.name: callback.sporadic for callback in loads(text).callbacks}
+    assert drafted == {'begin': False, 'give_up': True, 'retry': True}
+    results = [replay(path, loads(each)).result() for each in (MADE_AGAIN, text)]
+    if declared:
+        results.append(executor.statistics())
+        assert not results[-1]['not_found']
+    for result in results:
+        assert {name.rpartition(':')[2]: found for name, (*found, _) in verdicts(result).items()
+                if 'begin' not in name} == {name: [n, 0, 0] for name, n in expected.items()}
+
+
+def cut_anywhere(path, cut, seed):
+    """Write a part of a recording: to some event, and without the begins of some entities."""
+    random = Random(seed)
+    events = [*TraceReader(path).events()]
+    gone = {event[4] for event in events if event[0] == 'ros2:rcl_node_init'
+            and random.random() < 0.15}
+    until = random.randrange(20, len(events))
+    with TraceFile(cut, overwrite=True) as file:
+        for name, time_, pid, tid, *fields in events[:until]:
+            if name not in ('ros2:rcl_node_init', 'ros2:rclcpp_timer_link_node') or not (
+                    gone.intersection(fields)):
+                file.add(name, time_, pid, tid, *fields)
+
+
+@pytest.mark.parametrize('declared', [True, False], ids=['declared', 'undeclared'])
+def test_a_draft_of_a_part_of_a_recording_is_valid(make_executor, make_node, tmp_path, declared):
+    """Also of a cut one, and of one that began after some nodes."""
+    path, cut = tmp_path / 'run.mcap', tmp_path / 'cut.mcap'
+    run_fusion(make_executor, make_node, loads(READS) if declared else None, path, Reading)
+    n_valid = 0
+    for seed in range(30):
+        cut_anywhere(path, cut, seed)
+        try:
+            draft = System(cut).draft()
+        except InputError:      # no entities are left
+            continue
+        assert 'unknown' not in ''.join(declaration_errors(declaration_of(draft)))
+        accept(draft)
+        if draft.nodes:
+            found = loads(declaration_of(draft, accepted=True))
+            n_valid += 1
+            if declared:
+                wanted = {callback.key for callback in loads(READS).callbacks}
+                # another timer of the brake, which never fires, is not declared
+                assert {callback.key for callback in found.callbacks
+                        if ':callback_' not in callback.key} <= wanted
+    assert n_valid > 10
+
+
+class Reading(Fusion):
+    """A timer of the detector reads what its subscription stores, and the obstacles."""
+
+    def __init__(self, make_node):
+        super().__init__(make_node)
+        self.nodes['detector'].create_timer(0.01, lambda: None)
+
+
+READS = FUSED.replace('deadline: 5s}]\n  - node: /fusion', """deadline: 5s},
+                {name: watch, timer: 10ms, reads: [detect, /obstacles], deadline: none}]
+  - node: /fusion""") + """
+paths:
+  - {name: seen, callbacks: ['/camera:grab', '/detector:detect', '/detector:watch'], age: 9s}
+"""
+
+
+def declaration_errors(text):
+    """Return the errors of a drafted declaration, but for its blanks."""
+    try:
+        loads(text.replace('FILL IN', 'fill in'))
+    except GraphError as error:
+        return [str(each) for each in error.errors]
+    return []

@@ -57,8 +57,12 @@ NO_E = "/b:e never ran in the 0.500 s after the first release: did you mean the 
 SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
 
 
+WHEN_NEEDED = "if it is made, reset or cancelled when needed, declare 'sporadic: true'"
+
+
 @pytest.mark.parametrize(('changes', 'texts'), [
-    ({'publishes': {'/b:w': {'/q\x1b', '/p', '/parameter_events', '/mddag/jobs_1f/p0'}}},
+    ({'publishes': {'/b:w': {
+        '/q\x1b', '/p', '/parameter_events', '/mddag/jobs_1f/p0', '/diagnostics'}}},
      ['/b:w publishes /p, which it does not declare',
       '/b:w publishes /q\\x1b, which it does not declare']),
     ({'periods': {'/a:t': 10 * MS}}, []), ({'periods': {'/a:t': 10_010_000}}, []),
@@ -66,7 +70,7 @@ SKIPPED = {'/a:t': 20, '/b:m': 15, '/b:s': 20, '/b:e': 0}       # of 50 releases
      ['the timer of /a:t has a period of 11ms, and 10ms is declared']),
     (released(0.81), []), (released(1.19), []),
     (released(0.79), ['/a:t was released every 7.9ms, and 10ms is declared']),
-    (released(1.21), ['/a:t was released every 12.1ms, and 10ms is declared']),
+    (released(1.21), [f'/a:t was released every 12.1ms, and 10ms is declared: {WHEN_NEEDED}']),
     ({'got': {'/b:m': 39}}, []), ({'got': {'/b:m': 60}}, []),
     *(({'got': {'/b:m': got}}, [
         f'/b:m got {got} messages, and by the declaration 50 were due' + (
@@ -120,11 +124,13 @@ def test_a_source_that_stopped_is_named_although_its_results_were_in_time():
     seen.end_ns = 1_500 * MS
     assert [(each.kind, each.text) for each in drift(TASKS, seen)] == [
         ('stopped', f'/a:{name} was not released any more in the last {silent} s, and every '
-         f'{period} is declared')
-        for name, silent, period in (('t', '1.010', '10ms'), ('y', '1.020', '20ms'))]
-    rare = loads(TASKS.text.replace('period: 20ms', 'period: 20ms, sporadic: true').replace(
-        'timer: 10ms', 'timer: 10ms, once: true'))
-    assert [each.kind for each in drift(rare, seen)] == []
+         f'{period} is declared{more}')
+        for name, silent, period, more in (
+            ('t', '1.010', '10ms', f': {WHEN_NEEDED}'), ('y', '1.020', '20ms', ''))]
+    for key in ('once', 'sporadic'):
+        rare = loads(TASKS.text.replace('period: 20ms', 'period: 20ms, sporadic: true').replace(
+            'timer: 10ms', f'timer: 10ms, {key}: true'))
+        assert [each.kind for each in drift(rare, seen)] == []
 
 
 def test_of_publishers_only_those_that_always_publish_are_expected_to():

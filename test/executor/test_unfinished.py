@@ -1,0 +1,162 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""Callbacks that do not end: they are named live, in the trace, and as causes of misses."""
+
+from functools import partial
+import shutil
+import threading
+
+from mddag_executor import replay
+from mddag_executor.analysis import causes
+from mddag_executor.errors import MddagError
+from mddag_executor.executor import diagnostics, unfinished
+from mddag_executor.executor.session import Session
+from mddag_executor.report import tables
+from mddag_executor.report.live_runs import live_lines
+from mddag_executor.report.replays import summary
+from msg_graph import loads
+import pytest
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from .conftest import wait_for
+from .declared import graph
+
+GRAPH = graph(
+    robot="""
+        name: works, timer: 10ms, deadline: 5ms, dag: a
+        name: other, timer: 10ms, deadline: 9ms, dag: b""",
+    free='name: goes_on, timer: 10ms, deadline: 1s, dag: c')
+MS = 1_000_000
+
+
+class Robot:
+    """
+    A node of which a callback does not end in its third run, until it is released.
+
+    :param how: what it waits for.
+    """
+
+    def __init__(self, make_node, how):
+        self.runs = 0
+        self.let_go, self.future = threading.Event(), Future()
+        self.node, self.free = make_node('robot'), make_node('free')
+        self.client = self.node.create_client(
+            Trigger, '/never', callback_group=MutuallyExclusiveCallbackGroup())
+        body = {'lock': self.let_go.wait, 'service': partial(
+            self.client.call, Trigger.Request())}.get(how)
+        self.node.create_timer(0.01, self.awaits if body is None else partial(self.works, body))
+        self.node.create_timer(0.01, lambda: None)
+        self.free.create_timer(0.01, lambda: None)
+
+    def works(self, body):
+        self.runs += 1
+        if self.runs == 3:
+            body()
+
+    async def awaits(self):
+        self.runs += 1
+        if self.runs == 3:
+            await self.future
+
+    def release(self):
+        self.let_go.set()
+        for future in (self.future, *[*self.client._pending_requests.values()]):
+            future.set_result(None)
+
+
+def is_noted(path, killed):
+    """Return whether a killed process would leave a note of the execution; copy what it leaves."""
+    shutil.copy(path, killed)
+    try:
+        return len(replay(killed, loads(GRAPH)).recording.unfinished) == 1
+    except MddagError:      # nothing has been written yet
+        return False
+
+
+@pytest.mark.parametrize('how', ['lock', 'service', 'future'])
+@pytest.mark.parametrize('declared', [True, False], ids=['declared', 'undeclared'])
+def test_a_callback_that_does_not_end_is_named(
+        make_executor, make_node, tmp_path, monkeypatch, how, declared):
+    for module, name in ((unfinished, 'LONG_NS'), (causes, 'HANGS_NS'), (tables, 'LONG_NS'),
+                         (diagnostics, 'LONG_NS')):
+        monkeypatch.setattr(module, name, 20 * MS)
+    monkeypatch.setattr('mddag_executor.sources.imported_run.LEAST_UNFINISHED_NS', 20 * MS)
+    monkeypatch.setattr('mddag_executor.analysis.explain.HANGS_NS', 20 * MS)
+    path, killed = tmp_path / 'run.mcap', tmp_path / 'killed.mcap'
+    robot = Robot(make_node, how)
+    executor = make_executor(
+        loads(GRAPH) if declared else None, trace=str(path), diagnostics_period='10s',
+        nodes=[robot.node, robot.free])
+    session = Session(executor)
+    waits_for = {'lock': '', 'service': ', waits for service /never',
+                 'future': ', waits for a future'}[how]
+    where = f'(at {__name__.rpartition(".")[2]}.py:'
+    with session:
+        assert wait_for(lambda: robot.runs == 3)
+        hung = executor.statistics()['unfinished']
+        assert wait_for(lambda: (executor.statistics()['unfinished'] or hung)[0]['for_ns']
+                        > 200 * MS)
+        assert wait_for(partial(is_noted, path, killed))
+        level, message = executor._diagnostics._pool.status(0)[1:3]
+        assert (level, where in message, message.count('has run for')) == (1, True, 1)
+        session.hurry()
+    assert session.clean == (how == 'future')
+    statistics = executor.statistics()
+    lines = [line for line in live_lines({**statistics, 'measured': None})
+             if 'has not ended' in line]
+    robot.release()
+    name = '/robot:works' if declared else '/robot: '
+    assert len(lines) == 1 and lines[0].startswith(name)
+    assert where in lines[0] and lines[0].endswith(f'{waits_for})')
+    for trace in (path, killed):
+        replayed = replay(trace, loads(GRAPH))
+        result = replayed.result()
+        found, = result['unfinished']
+        assert (found['callback'], found['for_ns'] > 20 * MS) == ('/robot:works', True)
+        assert f'({found["where"]})'.startswith(where)
+        assert f'{found["where"]})'.endswith(f'{waits_for})'), found
+        assert any('/robot:works has not ended' in line for line in summary(result))
+        table = replayed.recording.executions
+        job, = table['job'][table['start'] == found['since_ns']].tolist()
+        why = replayed.explanation.causes()
+        assert why[0, job] == 'never ended'
+        if declared:    # without a declaration skipped releases are no jobs
+            found = {cause for (sink, each), cause in why.items() if sink < 2 and each > job}
+            assert 'never ended' in found and 'group' not in found
+        assert result['recording'].get('shut_down') is (trace is path)
+        assert not [each for each in replayed.drift() if each.kind == 'stopped'
+                    and each.callback != '/free:goes_on']
+
+
+def test_what_runs_long_and_ends_is_recorded_once(
+        make_executor, make_node, tmp_path, monkeypatch):
+    """Notes of executions that have ended after all, or went on, count for nothing."""
+    monkeypatch.setattr(unfinished, 'LONG_NS', 10 * MS)
+    path = tmp_path / 'run.mcap'
+    robot = Robot(make_node, 'future')
+    slow = make_node('slow')
+    ended = []
+
+    def work():
+        if not ended:
+            robot.let_go.wait()
+        ended.append(True)
+
+    slow.create_timer(0.01, work)
+    executor = make_executor(loads(GRAPH), trace=str(path), nodes=[robot.node, slow])
+    notes = []
+    note = executor._engine.note_unfinished
+    executor._engine.note_unfinished = lambda several, now: (
+        notes.append(len(several)), note(several, now))
+    with Session(executor):
+        assert wait_for(lambda: notes.count(2) > 1)
+        robot.release()
+        assert wait_for(lambda: robot.runs > 5 and len(ended) > 2)
+    replayed = replay(path)
+    assert 'unfinished' not in replayed.result()
+    table = replayed.recording.executions
+    assert (table['end'] >= table['start']).all()
+    rows = list(zip(*(table[name].tolist() for name in ('callback', 'start'))))
+    assert len(set(rows)) == len(rows)
