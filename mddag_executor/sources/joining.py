@@ -352,11 +352,11 @@ class Joined:
             for table in (of['releases'], of['executions'], of['job_ends']):
                 known = table['order'] >= 0
                 table['order'][known] = rank[table['order'][known]]
-            for column, numbers, names in (
+            for values, numbers, names in (
                     (of['drops']['reason'], reasons, part.found.drop_reasons),
                     (of['unfinished']['where'], places, part.found.places)):
-                column[:] = np.array([
-                    numbers.setdefault(each, len(numbers)) for each in names] or [0])[column]
+                values[:] = np.array([
+                    numbers.setdefault(each, len(numbers)) for each in names] or [0])[values]
             for table in of.values():
                 if 'process' in table.names:
                     table['process'] = part.place

@@ -122,7 +122,7 @@ def test_a_callback_that_does_not_end_is_named(
         job, = table['job'][table['start'] == found['since_ns']].tolist()
         why = replayed.explanation.causes()
         assert why[0, job] == 'never ended'
-        if declared:    # without a declaration skipped releases are no jobs
+        if declared:    # without a declaration skipped releases have no jobs
             found = {cause for (sink, each), cause in why.items() if sink < 2 and each > job}
             assert 'never ended' in found and 'group' not in found
         assert result['recording'].get('shut_down') is (trace is path)
