@@ -65,6 +65,24 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
     assert statistics['never_ran'] == []
 
 
+def test_messages_after_a_publication_that_failed_have_their_jobs(make_executor, make_node):
+    """The middleware has not counted it."""
+    def fail():
+        publisher, = (each for each in chain.nodes['source'].publishers if each.topic == '/a')
+        with pytest.raises(TypeError):
+            publisher.publish('no message')
+
+    chain = Declared(make_node, CHAIN, {'tick': fail})
+    executor = make_executor(loads(CHAIN))
+    with Spinning(executor):
+        chain.start(executor)
+        assert wait_for(lambda: len(chain.ran['last']) >= 6)
+        chain.cancel()
+        assert wait_for(lambda: len(chain.ran['last']) == len(chain.ran['tick']))
+    assert executor.statistics()['unattributed'] == {'unknown': 0, 'doubtful': 0}
+    assert None not in chain.jobs('last')
+
+
 TWO_TO_ONE = graph(
     left='name: fork, timer: 20ms, publishes: [/a, /left], dag: fork',
     worker="""

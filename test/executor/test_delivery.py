@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import matched, Spinning, wait_for
+from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import graph
 
 
@@ -78,6 +78,23 @@ def test_messages_after_a_failed_take_run_in_the_next_spin(make_executor, make_n
     for _ in range(10):
         executor.spin_once(0.2)
     assert got == ['0', '1', '2']
+
+
+def test_a_publication_that_fails_leaves_no_subscription_deaf(make_executor, make_node):
+    """While a thread publishes, no other one waits for messages on the topic."""
+    node, got = make_node(), []
+    publisher = node.create_publisher(Header, '/a', 10)
+    node.create_subscription(Header, '/a', got.append, 10)
+    executor = make_executor(num_workers=1, nodes=[node])
+    with Spinning(executor):
+        matched(publisher)
+        for count in range(1, 4):
+            assert wait_for(lambda: is_idle(executor))
+            with pytest.raises(TypeError):
+                publisher.publish('no message')
+            with publisher.handle:
+                publisher.handle.publish(Header())  # as a publisher of another process
+            assert wait_for(lambda n=count: len(got) == n)
 
 
 FOREIGN = """

@@ -438,14 +438,15 @@ def test_an_interrupt_at_any_line_of_a_spin_loses_nothing(
 
 @pytest.mark.parametrize('kind', ['sleep', 'call', 'coroutine', 'publish'])
 def test_a_callback_is_interrupted_at_once(make_executor, make_node, kind):
-    """Also one that computes in a call of the package: by the second SIGINT at the latest."""
-    node, begun, interrupts = make_node(), threading.Event(), []
+    """One in a call of the package by the second SIGINT at the latest."""
+    node, begun, interrupts, slept = make_node(), threading.Event(), [], []
     publisher = node.create_publisher(Header, '/topic', 10)
     client = node.create_client(Trigger, '/nobody')
 
     def sleep():
         begun.set()
-        time.sleep(30)
+        time.sleep(10)
+        slept.append(1)
 
     def call():
         begun.set()
@@ -468,6 +469,8 @@ def test_a_callback_is_interrupted_at_once(make_executor, make_node, kind):
         begun.wait(15)
         while not is_over.wait(0.1):
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            if kind in ('sleep', 'coroutine'):
+                break
 
     executor, is_over = make_executor(nodes=[node]), threading.Event()
     executor.create_task({'sleep': sleep, 'call': call, 'coroutine': coroutine,
@@ -479,10 +482,39 @@ def test_a_callback_is_interrupted_at_once(make_executor, make_node, kind):
         with pytest.raises(KeyboardInterrupt):
             while True:
                 executor.spin_once()
+        assert not slept
     finally:
         is_over.set()
         thread.join()
         assert signal.signal(signal.SIGINT, before) == raise_once
+
+
+def test_a_second_interrupt_comes_at_once(make_executor, make_node):
+    """The callback is in a call of the package, which may never end."""
+    node, come, before = make_node(), [], sys.gettrace()
+    publisher = node.create_publisher(Header, '/topic', 10)
+
+    def at_line(frame, event, arg):
+        if event == 'line':
+            sys.settrace(None)
+            for number in range(3):
+                come.append(number)
+                signal.raise_signal(signal.SIGINT)
+        return at_line
+
+    def publish():
+        sys.settrace(lambda frame, event, arg: (
+            at_line if '/mddag_executor/' in frame.f_code.co_filename else None))
+        publisher.publish(Header())
+
+    executor = make_executor(nodes=[node])
+    executor.create_task(publish)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            executor.spin_once(15.0)
+    finally:
+        sys.settrace(before)
+    assert come == [0, 1]
 
 
 PROGRAM = """

@@ -27,7 +27,7 @@ import pytest
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
-TESTS = HERE.parent.relative_to(ROOT)
+TESTS = HERE.parents[1].relative_to(ROOT)
 
 HUNG_S = 50
 """After this many seconds a test of a child hangs."""
@@ -63,7 +63,7 @@ if CHANGES := json.loads(os.environ.get('MDDAG_MUTATION', '[]')):
 @dataclass(frozen=True)
 class Case:
     """
-    A mutation and tests of ``test/executor`` that must notice it.
+    A mutation and tests that must notice it.
 
     :ivar changes: file in ``mddag_executor``, old and new text of each.
     :ivar every: each of them must notice it, else one of them.
@@ -78,8 +78,8 @@ class Case:
 
 
 def of(file, *names):
-    """Return the ids of a file's tests."""
-    return [f'{file}::{name}' for name in names]
+    """Return the ids of tests of a file, which is in ``test/executor`` if it has no folder."""
+    return [f'{file if "/" in file else f"executor/{file}"}::{name}' for name in names]
 
 
 UNNOTICED = """\
@@ -240,6 +240,132 @@ before = globals().setdefault('BEFORE', {})
         'core/tally.py', 'self.ends[dag][deadline] += 1',
         'self.ends[dag][COMPLETED if deadline == LATE else deadline] += 1')], of(
         'test_live_replay.py', 'test_replay_counts_what_the_executor_counted')),
+    # --- interrupts.py
+    Case('interrupts_come_anywhere', [(
+        'executor/interrupts.py', 'if self.is_pending or _may_interrupt(frame):', 'if True:')], of(
+        'test_spin.py', 'test_an_interrupt_at_any_line_of_a_spin_loses_nothing[True]',
+        'test_an_interrupt_at_any_line_of_a_spin_loses_nothing[False]')),
+    Case('deferred_interrupts_are_lost', [(
+        'executor/interrupts.py', 'self.is_pending = True', 'pass')], of(
+        'test_spin.py', 'test_an_interrupt_at_any_line_of_a_spin_loses_nothing[True]')),
+    Case('a_second_interrupt_is_deferred_too', [(
+        'executor/interrupts.py', 'if self.is_pending or _may_interrupt(frame):',
+        'if _may_interrupt(frame):')], of(
+        'test_spin.py', 'test_a_second_interrupt_comes_at_once')),
+    Case('callbacks_are_not_interruptible', [(
+        'executor/interrupts.py', 'if frame.f_code in _interruptible:', 'if False:')], of(
+        'test_spin.py', *(f'test_a_callback_is_interrupted_at_once[{kind}]' for kind in (
+            'sleep', 'coroutine')))),
+    # --- silences.py, optional_topics.py
+    Case('silences_are_not_announced', [(
+        'executor/silences.py', 'self._engine.optional_topics.on_silent.append(self._announce)',
+        'self._engine.optional_topics.on_silent.append(lambda *_: None)'), (
+        'executor/silences.py', 'self._engine.optional_topics.on_silent.remove(self._announce)',
+        'pass')], of(
+        'test_other_processes.py',
+        'test_a_result_that_another_machine_did_not_ask_for_is_not_due[machines]')),
+    Case('silences_of_any_time_are_believed', [(
+        'executor/silences.py', '\n                and is_plausible(release, now)', '')], of(
+        'test_other_processes.py', 'test_forged_silences_are_ignored')),
+    Case('silences_of_any_topic_are_believed', [(
+        'executor/optional_topics.py', 'return dag >= 0 and self._expected', """\
+return True or self._expected""")], of(
+        'test_other_processes.py', 'test_forged_silences_are_ignored')),
+    Case('what_was_not_published_stays_due', [(
+        'executor/optional_topics.py', 'if topic not in published:', 'if False:')], of(
+        'test_ordinary_robots.py',
+        'test_results_that_nothing_was_published_for_are_not_due')),
+    Case('what_was_published_is_not_due', [(
+        'executor/optional_topics.py', 'if topic not in published:', 'if True:')], of(
+        'test_ordinary_robots.py',
+        'test_results_that_nothing_was_published_for_are_not_due')),
+    Case('silences_of_one_topic_are_of_all', [(
+        'executor/optional_topics.py', 'if each == topic:', 'if True:')], of(
+        'test_other_processes.py',
+        'test_a_result_that_another_machine_did_not_ask_for_is_not_due[machines]')),
+    # --- answers.py
+    Case('each_answer_is_of_the_newest_job', [(
+        'executor/answers.py', """\
+awaiting.named(
+                topic, header_stamp(message), work.answers) or NO_ORIGIN""", 'work.answers')], of(
+        'test_ordinary_robots.py',
+        'test_the_stamp_of_a_result_says_which_of_several_messages_was_used')),
+    Case('executions_that_publish_nothing_answer', [(
+        'executor/answers.py', ' and awaiting.is_answer(work.published)', '')], of(
+        'test_ordinary_robots.py', 'test_a_sync_of_two_rates',
+        'test_the_stamp_of_a_result_says_which_of_several_messages_was_used')),
+    Case('messages_without_a_job_answer_nothing', [(
+        'executor/answers.py', 'awaiting.newest(self._is_open) or NO_ORIGIN', 'NO_ORIGIN')], of(
+        'test_ordinary_robots.py', 'test_a_sync_of_two_rates',
+        'test_the_stamp_of_a_result_says_which_of_several_messages_was_used')),
+    # --- bypass.py
+    Case('the_bypass_runs_the_last_one_first', [(
+        'executor/bypass.py', 'self.queue.popleft()', 'self.queue.pop()')], of(
+        'test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
+    Case('the_core_does_not_hear_of_those_that_wait', [(
+        'executor/bypass.py', 'found = self.running, self._running_since, self.queue',
+        'found = self.running, self._running_since, deque()')], of(
+        'test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
+    # --- outer_places.py
+    Case('callbacks_of_a_program_run_together', [(
+        'executor/outer_places.py', 'self._scheduler.open_outer(outer, limit, once)',
+        'self._scheduler.open_outer(outer, 9 * limit, once)')], of(
+        'test_outer_groups.py', 'test_so_many_run_at_a_time[1]',
+        'test_so_many_run_at_a_time[2]'), every=True),
+    Case('a_program_s_executor_runs_on_after_one_step', [(
+        'executor/outer_places.py', 'self._scheduler.open_outer(outer, limit, once)',
+        'self._scheduler.open_outer(outer, limit, False)')], of(
+        'test_outer_groups.py', 'test_a_step_runs_one')),
+    Case('what_waits_stays_in_the_group_that_its_node_has_left', [(
+        'executor/outer_places.py', 'self._scheduler.set_outer(work.x, outer)', 'pass')], of(
+        'test_outer_groups.py', 'test_what_waits_moves_with_its_node')),
+    Case('waiting_for_a_program_is_counted_again_and_again', [(
+        'executor/outer_places.py', 'self._state.outer_wait[outer] = 0', 'pass')], of(
+        'test_outer_groups.py', 'test_so_many_run_at_a_time[1]')),
+    # --- other_processes.py
+    Case('each_message_of_a_stamp_starts_a_job', [(
+        'executor/other_processes.py', 'if job is None:', 'if True:')], of(
+        'test_other_processes.py', 'test_a_dag_leaves_and_comes_back_to_the_same_job')),
+    Case('what_came_by_its_stamp_is_released_when_it_arrives', [(
+        'executor/other_processes.py', 'self._start_job(dag, release, now)',
+        'self._start_job(dag, now, now)')], of(
+        'test_other_processes.py',
+        'test_a_job_goes_on_in_another_executor_with_its_stamp_as_release')),
+    Case('stamps_of_published_messages_are_forgotten', [(
+        'executor/other_processes.py', 'self._attribution.note_headers(self.note, leaving)',
+        'pass')], of(
+        'test_other_processes.py', 'test_a_dag_leaves_and_comes_back_to_the_same_job')),
+    Case('publications_are_not_announced', [(
+        'executor/other_processes.py', 'self._attribution.announce_on(announced)', 'pass')], of(
+        'test_other_processes.py', 'test_every_job_is_found_by_its_number')),
+    # --- publishing.py
+    Case('a_publication_that_failed_is_counted', [(
+        'executor/publishing.py',
+        'state.count -= 1  # the middleware has not counted it', 'pass')], of(
+        'test_deadlines.py', 'test_messages_after_a_publication_that_failed_have_their_jobs')),
+    Case('a_failed_publication_leaves_the_descriptors_off', [(
+        'executor/publishing.py', """\
+        finally:
+            for delivery in deliveries:""", """\
+        except ZeroDivisionError:
+            pass
+        else:
+            for delivery in deliveries:""")], of(
+        'test_delivery.py', 'test_a_publication_that_fails_leaves_no_subscription_deaf')),
+    Case('publications_of_another_executor_have_jobs_here', [(
+        'executor/publishing.py', 'if running is None or running.pool is not pool:',
+        'if running is None:')], of(
+        'test_other_processes.py',
+        'test_without_a_stamp_a_message_of_another_executor_has_no_job')),
+    Case('calls_keep_their_worker', [(
+        'executor/publishing.py', """\
+        with running.lend():
+            return call(self, request, *args, **kwargs)""", """\
+        return call(self, request, *args, **kwargs)""")], of(
+        'test_bounds.py', 'test_blocked_calls_take_a_bounded_number_of_threads')),
+    Case('triggers_are_not_announced', [(
+        'executor/publishing.py', 'announce_trigger(self.pointer)', 'pass')], of(
+        'test_executor.py', 'test_each_of_many_runs_once[spin-of_guards]')),
 ]
 
 
@@ -281,7 +407,8 @@ def run(folder, name, changes, tests, *options):
             os.killpg(child.pid, signal.SIGKILL)  # and what it may have left
     found = {}
     for case in ElementTree.parse(report).iter('testcase'):
-        test = f'{case.get("classname").rpartition(".")[2]}.py::{case.get("name")}'
+        file = case.get('classname').removeprefix(f'{TESTS}.').replace('.', '/')
+        test = f'{file}.py::{case.get("name")}'
         messages = [each.get('message') or 'failed' for each in case]
         found[test] = ' '.join(messages), float(case.get('time'))
     return Result(found, output[-6000:])

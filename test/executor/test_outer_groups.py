@@ -1,0 +1,83 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The callbacks of a program that a host opens and closes: so many of them run at a time."""
+
+import threading
+
+import pytest
+from rclpy.callback_groups import ReentrantCallbackGroup
+from std_msgs.msg import Header
+
+from .conftest import matched, Spinning, wait_for
+
+FAR_S = 15.0
+
+
+@pytest.mark.parametrize('limit', [1, 2])
+def test_so_many_run_at_a_time(make_executor, limit):
+    """And how long the others waited for them is reported once."""
+    executor, lock, inside, most = make_executor(num_workers=4), threading.Lock(), [], []
+    go_on = threading.Event()
+
+    def work():
+        with lock:
+            inside.append(1)
+            most.append(len(inside))
+        go_on.wait(FAR_S)
+        with lock:
+            inside.pop()
+
+    def begin():
+        tasks = [executor.create_task_in(group.number, work) for _ in range(4)]
+        assert wait_for(executor.create_task(lambda: None).done)    # of no group
+        return tasks
+
+    group = executor.new_outer_group()
+    with Spinning(executor):
+        tasks = begin()
+        assert not most             # it is closed
+        assert group.open(limit)
+        assert wait_for(lambda: len(inside) == limit)
+        tasks += begin()
+        go_on.set()
+        assert wait_for(lambda: all(task.done() for task in tasks))
+        assert max(most) == limit
+        assert group.take_wait_ns() > 0 == group.take_wait_ns()
+
+
+def test_a_step_runs_one(make_executor):
+    executor, ran = make_executor(num_workers=2), []
+    group = executor.new_outer_group()
+    with Spinning(executor):
+        for number in range(3):
+            executor.create_task_in(group.number, ran.append, number)
+        for count in (1, 2):
+            assert group.open(1, once=True)
+            assert wait_for(lambda n=count: len(ran) == n)
+            for _ in range(5):
+                assert wait_for(executor.create_task(lambda: None).done)
+            assert ran == [*range(count)]
+    executor.shutdown()
+
+
+def test_what_waits_moves_with_its_node(make_executor, make_node):
+    """As if it had come to the group that its node belongs to now."""
+    node, got = make_node(), []
+    node.create_subscription(
+        Header, '/a', lambda message: got.append(message.frame_id), 10,
+        callback_group=ReentrantCallbackGroup())
+    publisher = node.create_publisher(Header, '/a', 10)
+    executor = make_executor(num_workers=1, nodes=[node])
+    shut, opened = executor.new_outer_group(), executor.new_outer_group()
+    executor.put(node, shut)
+    with Spinning(executor):
+        matched(publisher)
+        for number in range(3):
+            publisher.publish(Header(frame_id=str(number)))
+        assert wait_for(lambda: executor.statistics()['queue'] == 3)
+        opened.open(1)
+        assert wait_for(executor.create_task(lambda: None).done)
+        assert not got
+        executor.put(node, opened)
+        assert wait_for(lambda: len(got) == 3)
+    assert got == ['0', '1', '2']
