@@ -40,7 +40,7 @@ def check(recording, skip=0):
 
 
 @given(st.integers(0, 2**32), st.data())
-@examples(40)
+@examples(25)
 def test_verdicts_of_any_tables(seed, data):
     """Tables that no executor records: ends and completions in any order, twice, or of no job."""
     with tempfile.TemporaryDirectory() as folder:
@@ -179,7 +179,7 @@ nodes:
 @given(declarations(), st.integers(0, 2**32), st.integers(1, 4),
        st.sampled_from(['rad', 'fifo', 'rm']), st.integers(1, 25),
        st.sampled_from([0, 70 * MS]), st.lists(st.integers(1, 150), max_size=3, unique=True))
-@examples(40)
+@examples(25)
 @example(SMALL, 1, 2, 'rad', 8, 0, [])
 @example(SMALL + PATHS, 1, 2, 'rad', 20, 0, [40, 90])
 @example(EARLY, 1, 2, 'fifo', 1, 0, [])

@@ -31,10 +31,10 @@ def drive(tmp_path_factory):
 
 
 def mddag(folder, *args, status=0, python=('-m', 'mddag_executor'), **more):
-    """Run mddag in a folder, as a user would."""
+    """Run mddag in a folder, as a user would who has fixed the hashes: else it starts twice."""
     done = subprocess.run(
         [sys.executable, *python, *args], cwd=folder, capture_output=True, text=True,
-        check=False, timeout=120, env={**os.environ, **more})
+        check=False, timeout=120, env={'PYTHONHASHSEED': '0', **os.environ, **more})
     assert done.returncode == status, done.stderr
     return done
 
@@ -120,7 +120,7 @@ MADE = ('rerun', 'drive.mcap', 'graph.yaml', '--node', 'hashes:make', '--json', 
 
 def test_hashes_are_fixed_however_the_program_is_installed(drive, monkeypatch):
     """`ros2 run` starts PREFIX/lib/PACKAGE/mddag, which colcon has put there."""
-    monkeypatch.delenv('PYTHONHASHSEED', raising=False)
+    monkeypatch.setenv('PYTHONHASHSEED', 'random')     # as if it were not set
     (drive / 'hashes.py').write_text(HASHES)
     script = drive / 'lib' / 'mddag_executor' / 'mddag'
     script.parent.mkdir(parents=True)

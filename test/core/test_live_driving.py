@@ -488,7 +488,7 @@ class LiveDriver(RuleBasedStateMachine):
 
 
 TestLiveDriver = LiveDriver.TestCase
-TestLiveDriver.settings = examples(200)
+TestLiveDriver.settings = examples(120)
 
 
 def test_a_groups_number_is_used_again_once_nothing_of_it_runs_or_waits():

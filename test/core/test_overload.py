@@ -28,7 +28,7 @@ def with_times(case, on_late=None, **more):
         for dag, row in zip(case.task_set.dags, case.ticks))))
 
 
-@examples(300)
+@examples(150)
 @given(cases(bounds=False, importance=True), st.integers(5, 60))
 def test_demote_without_an_overload_changes_nothing(case, horizon):
     case = with_times(case)
@@ -47,7 +47,7 @@ def demand(case):
                for dag, row in zip(case.task_set.dags, case.ticks))
 
 
-@examples(300)
+@examples(150)
 @given(cases(importance=True), st.integers(5, 60))
 def test_importance_means_nothing_if_late_jobs_are_not_demoted(case, horizon):
     """Policies whose keys are not times never demote them."""
@@ -57,7 +57,7 @@ def test_importance_means_nothing_if_late_jobs_are_not_demoted(case, horizon):
     assert case.events(important.run(horizon)) == case.events(plain.run(horizon))
 
 
-@examples(300)
+@examples(150)
 @given(cases(('rad', 'gedf', 'llf'), groups=False, bounds=False, importance=True),
        st.integers(5, 60))
 def test_messages_of_a_callback_keep_their_order(case, horizon):
@@ -71,7 +71,7 @@ def test_messages_of_a_callback_keep_their_order(case, horizon):
         assert jobs == sorted(of_source)[:len(jobs)]
 
 
-@examples(300)
+@examples(150)
 @given(st.lists(st.sampled_from((0, 1, 'run', 'wait')), min_size=4, max_size=40))
 def test_messages_of_each_topic_of_a_sync_keep_their_order(steps):
     """Also if those of the other topic belong to jobs released earlier or later."""
@@ -207,7 +207,7 @@ def test_each_callback_runs_once_in_about_ten_deadlines(keep, importance, late):
     assert max(after - before for before, after in zip(starts, starts[1:])) <= 10 * 100 + 30
 
 
-@examples(300)
+@examples(150)
 @given(cases(('rad', 'gedf', 'llf'), max_dags=4, max_callbacks=1, groups=False, bounds=False,
              importance=True, newest=True), st.integers(1, 5))
 def test_no_callback_starves(case, heavier):

@@ -74,15 +74,16 @@ def test_the_paper_s_figure(autoware):
     The draws come from the quantile tables of the measured values, not from the values; with
     these, it was within 1.8 (seeds 0 to 2).
     """
-    outcome = evaluate(Experiment(autoware, ('rad', 'rm', 'wc')), 5000, jobs=2, compiled=True)
-    counts = outcome.bound().runs
+    runs = 1500 * int(os.environ.get('MDDAG_THOROUGH', '1'))
+    outcome = evaluate(Experiment(autoware, ('rad', 'rm', 'wc')), runs, jobs=2, compiled=True)
+    counts, share = outcome.bound().runs, runs / 5000
     for ours, theirs in zip(counts, REFERENCE_COUNTS):
-        assert abs(ours - theirs) < 4 * math.sqrt(ours + theirs)
+        assert abs(ours - share * theirs) < 4 * math.sqrt(ours + share ** 2 * theirs)
     for name, acceptance in outcome.by_policy().items():
         for ours, n, theirs, m in zip(
                 acceptance.ratio, counts, REFERENCE[name], REFERENCE_COUNTS):
             both = (ours * n + theirs * m) / (n + m)
-            deviation = math.sqrt(both * (1 - both) * (1 / n + 1 / m))
+            deviation = math.sqrt(both * (1 - both) * (1 / max(n, 1) + 1 / m))
             assert abs(ours - theirs) <= 4 * deviation + 1e-4
     bound = outcome.bound().total
     assert bound is not None and abs(bound - (1 - .104)) < 0.02
@@ -221,13 +222,13 @@ def test_the_outcome_is_that_of_this_machine(cluster, autoware):
     killed = []
 
     def kill(done):
-        if not killed and done > 20:
+        if not killed and done > 10:
             killed.append(victim)
             os.kill(victim, signal.SIGKILL)
 
     experiment = Experiment(autoware, ('rad', 'fifo'), duration_ns=200_000_000)
     found = evaluate(
-        experiment, 300, first_run=7, compiled=False, dask=cluster.scheduler_address,
+        experiment, 120, first_run=7, compiled=False, dask=cluster.scheduler_address,
         progress=kill)
     assert killed and same(found, evaluate(
-        experiment, 300, first_run=7, compiled=False, jobs=2))
+        experiment, 120, first_run=7, compiled=False, jobs=2))

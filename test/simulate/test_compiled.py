@@ -53,7 +53,7 @@ def compare(case, horizon, judge='horizon', stop=False):
     assert found.ended == plain.ended_ns
 
 
-@examples(1000)
+@examples(300)
 @given(EVERY_RULE, st.integers(5, 60), st.sampled_from(['horizon', 'completions']),
        st.booleans())
 def test_everything_at_once(case, horizon, judge, stop):
@@ -107,7 +107,7 @@ def with_everything(load_, tables, chances):
     return load_
 
 
-@examples(800)
+@examples(250)
 @given(EVERY_RULE, st.integers(5, 60), st.booleans(), st.integers(0, 2 ** 32))
 def test_machine_messages_and_processes(case, horizon, stop, seed):
     chances = random.Random(seed)
@@ -124,7 +124,7 @@ def test_machine_messages_and_processes(case, horizon, stop, seed):
     assert schedule(tables, as_arrays(load_), settings, log=True) == plain
 
 
-@examples(15)
+@examples(10)
 @given(cases(overheads=True, importance=True, max_callbacks=12))
 def test_long_runs(case):
     """Overload for long: slots, queues and stale entries grow and are swept."""

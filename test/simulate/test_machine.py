@@ -226,7 +226,7 @@ def some_jobs(draw):
     return jobs
 
 
-@examples(400)
+@examples(200)
 @given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans(), st.booleans())
 def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, divided):
     for job in jobs:  # processes with a pool of their own have an interpreter of their own

@@ -215,7 +215,7 @@ def record(case, horizon, trace, **how):
     return run
 
 
-@examples(60)
+@examples(30)
 @example(case=TWO_SINKS_AT_ONCE, horizon=5, stop=False)
 @example(case=DROPPED_LAST, horizon=12, stop=False)
 @given(case=cases(overheads=True, newest=True), horizon=st.integers(5, 50), stop=st.booleans())
@@ -241,7 +241,7 @@ def test_the_replayer_counts_the_same(trace, case, horizon, stop):
         assert replay(trace).result()['duration_ns'] <= stopped.ended_ns
 
 
-@examples(100)
+@examples(50)
 @given(case=cases(), last_release=st.integers(5, 25))
 def test_rescheduled_alike_it_runs_alike(trace, case, last_release):
     """
