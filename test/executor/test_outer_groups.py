@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""The callbacks of a program that a host opens and closes: so many of them run at a time."""
+"""A host opens and closes the callbacks of a program, and limits how many run at a time."""
 
 import threading
 
