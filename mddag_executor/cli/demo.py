@@ -43,7 +43,8 @@ class DemoError(MddagError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('--duration', type=options.duration, default=20 * 10 ** 9, metavar='TIME',
-        help="how long to measure this executor (default: 20s), and half of it rclpy's")
+        help="how long to measure this executor (default: 20s); rclpy's is measured for half of "
+        'that time')
     add('--utilisation', type=options.positive_float, default=UTILISATION, metavar='U',
         help='utilisation that execution times are scaled to (default: %(default)s)')
     add('-o', '--output', default='build/demo', metavar='DIR',

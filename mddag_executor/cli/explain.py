@@ -66,7 +66,7 @@ def _sink(name: str, task_set: TaskSet) -> int:
     sinks = {v.name: i for i, v in enumerate(task_set.vertices) if v.deadline_ns is not None}
     found = [name] if name in sinks else [each for each in sinks if each.endswith(name)]
     if len(found) > 1:
-        raise UsageError(f'--sink: {quoted(name)} may be any of {listed(found)}: write more of it')
+        raise UsageError(f'--sink: {quoted(name)} fits {listed(found)}: write more of the name')
     if not found:
         raise UsageError(f'--sink: there is no sink {quoted(name)}: ' + did_you_mean(
             name, sinks, 'mddag graph check lists them'))

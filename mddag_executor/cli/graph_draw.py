@@ -69,7 +69,7 @@ def _find_dot(output: str) -> str:
     program = shutil.which('dot')
     if program is None:
         raise InputError(
-            output, "this needs Graphviz, and its program 'dot' is not there",
+            output, "this needs Graphviz, whose program 'dot' was not found",
             "install it with 'sudo apt install graphviz', or name an OUT.dot or OUT.mmd")
     return program
 

@@ -101,8 +101,8 @@ class Source(NamedTuple):
     def no_graph(self) -> UsageError:
         """Return the error about a bag that is not rescheduled, or has no graph."""
         return UsageError(
-            f'{self.name}: no run of this executor is recorded in it, so there are no jobs: to '
-            'take its messages as releases give a GRAPH and --reschedule')
+            f'{self.name}: no run of this executor is recorded in it, so there are no jobs: '
+            "'mddag replay BAG GRAPH --reschedule' uses its messages as releases")
 
 
 def source_of(args: argparse.Namespace) -> Source:
@@ -183,8 +183,8 @@ def _rescheduled_bag(
     path, task_set = source.path, source.task_set
     assert isinstance(path, str)
     if args.processes is not None:
-        raise UsageError('--processes: an ordinary bag does not say what computes: leave the '
-                         'option out')
+        raise UsageError('--processes: an ordinary bag does not say which callbacks compute: '
+                         'leave the option out')
     if task_set is None or not args.reschedule:
         raise source.no_graph()
     times = None

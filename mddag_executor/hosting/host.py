@@ -655,8 +655,8 @@ class Host:
             if guest is not None:
                 guest.uses_ros = True
                 get_logger('mddag_executor').warning(
-                    f'--node {guest.program.spec}: it has a context of its own: what runs in that '
-                    'is neither ordered nor judged here')
+                    f'--node {guest.program.spec}: it has a context of its own: callbacks '
+                    'in it are neither ordered nor judged here')
 
         return init
 
@@ -722,7 +722,7 @@ def nodes_of(
             if not guest.nodes:
                 raise LoadingError(
                     guest.program.spec, f'it has made no node in {START_TIMEOUT_S:g} s, so its '
-                    'process is unknown', f'name that: PROCESS={guest.program.spec}')
+                    'process is unknown', f'name the process: PROCESS={guest.program.spec}')
         then([[n.get_fully_qualified_name() for n in guest.nodes] for guest in host.guests])
 
     with Host() as host:

@@ -71,7 +71,7 @@ def _read_values(archive: Any, key: str, name: str) -> Times:
     # false for NaN
     if values.ndim != 1 or not values.size or not np.all((values >= 0) & (values < DAY)):
         raise InputError(
-            name, f'the values of {key} are damaged, or no list of ns below one day', _REMEDY)
+            name, f'the values of {key} are damaged, or not a list of ns below one day', _REMEDY)
     rounded: Times = np.maximum(np.ceil(values / 1000).astype(np.int64), 1) * 1000
     return rounded
 

@@ -37,10 +37,10 @@ def check_plot(path: str) -> None:
     """Find out whether a figure can be drawn into this file, before the work starts."""
     if os.path.splitext(path)[1].lower() not in FORMATS:
         raise InputError(
-            path, 'the ending names no kind of picture', f'use one of {", ".join(FORMATS)}')
+            path, 'unsupported file extension', f'use one of {", ".join(FORMATS)}')
     if find_spec('matplotlib') is None:
         raise InputError(
-            path, 'matplotlib, which draws it, is not there',
+            path, 'matplotlib, which draws it, is not installed',
             "install 'mddag_executor[batch]' with pip")
 
 

@@ -142,7 +142,7 @@ def open_input(
     if processes:
         messages.warnings.append(
             f'{task_set.file}: processes: all nodes run in one here, with its workers and its '
-            'interpreter, and messages between them take no longer')
+            'interpreter, and messages between them take no extra time')
     if not messages.topics:
         if run is None:
             raise UsageError(

@@ -181,7 +181,7 @@ class Messages:
         def ask(node: Node, *args: Any, **more: Any) -> Any:
             self._loop.warn(
                 f'{node.get_fully_qualified_name()}: {original.__name__} asks the middleware, '
-                'which does not find the same in each run')
+                'whose answer is not the same in each run')
             return original(node, *args, **more)
 
         return ask

@@ -217,7 +217,8 @@ class Rerun:
             if isinstance(entity, WaitableEntity) and not self._requests.knows(
                     entity.rclpy_object):
                 self._loop.warn(
-                    f'{entity.name}: a waitable of its own kind, which never gets ready')
+                    f'{entity.name}: a waitable of a kind that a rerun does not know: it never '
+                    'becomes ready')
         self._timers.refresh(registry.of_kind(TimerEntity))
         self._messages.refresh(nodes, added, registry.of_kind(SubscriptionEntity))
 

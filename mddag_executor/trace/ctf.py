@@ -553,8 +553,8 @@ class _Importer:
                 'add the contexts vpid and vtid when recording')
         if self._impossible:
             result.warnings.append(
-                f'{path}: left out {counted(self._impossible, "event")} of processes or threads '
-                'that cannot be')
+                f'{path}: left out {counted(self._impossible, "event")} with '
+                'impossible numbers of processes or threads')
 
 
 def _merged(tables: Sequence[Columns]) -> Columns:

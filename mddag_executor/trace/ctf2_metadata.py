@@ -87,7 +87,7 @@ def _fragments(text: str) -> Iterator[_Object]:
         try:
             found = json.loads(part)
         except ValueError:
-            raise MetadataError(f'its fragment {number} is cut or no JSON') from None
+            raise MetadataError(f'its fragment {number} is cut, or not JSON') from None
         if not isinstance(found, dict):
             raise MetadataError(f'its fragment {number} is not a JSON object')
         yield found

@@ -101,7 +101,7 @@ def test_a_dense_graph_is_drawn_quickly(call, tmp_path):
 
 
 @pytest.mark.parametrize(('dot', 'status', 'says'), [
-    (None, 2, "error: o.svg: this needs Graphviz, and its program 'dot' is not there: install it "
+    (None, 2, "error: o.svg: this needs Graphviz, whose program 'dot' was not found: install it "
      "with 'sudo apt install graphviz', or name an OUT.dot or OUT.mmd\n"),
     ('cat >/dev/null\necho no fonts >&2\nexit 3\n', 2,
      'error: o.svg: Graphviz failed (no fonts): '),

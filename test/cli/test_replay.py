@@ -61,7 +61,7 @@ def test_a_sink_is_named_as_tables_do_or_by_a_unique_end(call, folder):
         done = call('explain', 'r.mcap', '--sink', name, '--job', '1')
         assert (done.returncode, done.stderr) == (0, '')
         assert done.stdout.startswith('Job 1 of one:t: late by ')
-    for name, says in ((':t', "':t' may be any of '/a/one:t', '/b/two:t': write more of it"),
+    for name, says in ((':t', "':t' fits '/a/one:t', '/b/two:t': write more of the name"),
                        ('ona:t', "there is no sink 'ona:t': did you mean '/a/one:t'?")):
         assert call('explain', 'r.mcap', '--sink', name) == (2, '', f'error: --sink: {says}\n')
 

@@ -411,9 +411,9 @@ def test_hostile_ctf2_is_refused(payload, more, says, tmp_path):
     ('\x1e{"type": "preamble", "version": 3}', 'it is of version 3 of CTF'),
     ('\x1e{"type": "preamble", "version": 2, "extensions": {"a": {}}}', 'extensions'),
     ('\x1e{"type": "preamble", "version": 2, "uuid": 99999999999}', 'no UUID'),
-    ('\x1e{"type": "preamble", "version": 2', 'its fragment 1 is cut or no JSON'),
+    ('\x1e{"type": "preamble", "version": 2', 'its fragment 1 is cut, or not JSON'),
     ('\x1e{"type": ' + '[' * 200_000, 'nested too deep'),
-    ('\x1e{"type": "trace-class"}', 'only preamble'), ('\x1e', 'is cut or no JSON')])
+    ('\x1e{"type": "trace-class"}', 'only preamble'), ('\x1e', 'is cut, or not JSON')])
 def test_ctf2_that_is_cut_is_one_error(text, says, tmp_path):
     (tmp_path / 'metadata').write_text(text)
     with pytest.raises(TraceError, match=f'{UNREADABLE}.*{re.escape(says)}'):
