@@ -49,14 +49,14 @@ from mddag_executor.simulate.deliveries import (
 )
 from mddag_executor.simulate.dispatch import dispatch
 from mddag_executor.simulate.machine import (
-    decide,
+    advance_machine,
+    assign_cpus,
+    decide_overtaking,
     fill_machine,
     is_used,
     Machine,
     NEXT_TIME,
-    settle,
-    share,
-    starts,
+    on_dispatch,
 )
 from mddag_executor.simulate.pool import (
     divide,
@@ -125,7 +125,7 @@ def run(
             progress(now)
         seen = len(s.decisions)
         if stops:
-            settle(s, m, now)
+            advance_machine(s, m, now)
         for w in range(n_workers):
             if p.finish_at[w] == now:
                 p.finish_at[w] = NEVER
@@ -151,7 +151,7 @@ def run(
             next_release += 1
         _dispatch(t, s, p, d, m, key, load, o, now)
         if stops:
-            share(s, m, now, p.finish_at)
+            assign_cpus(s, m, now, p.finish_at)
         if o.stop_at_first_miss != 0 and any_missed(s, seen):
             break
     for w in range(n_workers):
@@ -231,7 +231,7 @@ def _dispatch(
     """Dispatch executions; ``Pool.running`` has the preempted ones for the log."""
     sends, stops = len(load.delay_base) > 0, is_used(m)
     if stops:
-        decide(t, s, p, m, now)
+        decide_overtaking(t, s, p, m, now)
     x = dispatch(t, s, p, key, now)
     while x >= 0:
         worker = s.x_worker[x]
@@ -245,11 +245,11 @@ def _dispatch(
             _note(t, s, p, now, START, worker, x)
         p.running[worker] = x
         if stops:
-            starts(s, load, m, x, now)
+            on_dispatch(s, load, m, x, now)
         if sends:
             sends_at_start(t, s, load, d, m, x, now)
         if stops:
-            decide(t, s, p, m, now)
+            decide_overtaking(t, s, p, m, now)
         x = dispatch(t, s, p, key, now)
 
 

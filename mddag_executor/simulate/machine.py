@@ -71,15 +71,15 @@ class Machine(NamedTuple):
     at: list[int]
     need: list[int]
     until: list[int]
-    share: list[int]
+    assigned_in: list[int]
     # stopped executions; computing executions, first those with a CPU; those that begin to compute
-    still: list[int]
+    stalled: list[int]
     computing: list[int]
     joining: list[int]
     # by interpreter, from 1: executions that need its GIL, the holder first; the previous holder
     # while others waited, or -1; when the next one gets it
     lock_queue: list[list[int]]
-    lock_had: list[int]
+    previous_holder: list[int]
     switch_at: list[int]
 
 
@@ -94,7 +94,7 @@ def fill_machine(s: State, m: Machine, cpus: int, python: int) -> None:
         m.scalars.append(value)
     for _ in range(len(s.overtaking)):
         add_heap(m.lock_queue)
-        m.lock_had.append(-1)
+        m.previous_holder.append(-1)
         m.switch_at.append(NEVER)
 
 
@@ -108,15 +108,15 @@ def progress(s: State, x: int, now: int) -> int:
     return s.x_cost[x] - s.x_left[x] + now - s.x_started[x]
 
 
-def settle(s: State, m: Machine, now: int) -> None:
+def advance_machine(s: State, m: Machine, now: int) -> None:
     """Advance the machine to the present time."""
     passed = now - m.scalars[COUNTED_UNTIL]
-    for i in range(len(m.still)):
-        s.x_left[m.still[i]] += passed
+    for i in range(len(m.stalled)):
+        s.x_left[m.stalled[i]] += passed
     m.scalars[COUNTED_UNTIL] = now
 
 
-def decide(t: Tables, s: State, p: Pool, m: Machine, now: int) -> None:
+def decide_overtaking(t: Tables, s: State, p: Pool, m: Machine, now: int) -> None:
     """Decide by process whether the first waiting execution may overtake the last holder."""
     m.scalars[OVERTAKE_AT] = NEVER
     if s.scalars[N_HOLDING] == 0 or first_to_run(s, p, 0) < 0:
@@ -141,17 +141,18 @@ def decide(t: Tables, s: State, p: Pool, m: Machine, now: int) -> None:
                     m.scalars[OVERTAKE_AT] = pays_at
 
 
-def starts(s: State, load: Workload, m: Machine, x: int, now: int) -> None:
+def on_dispatch(s: State, load: Workload, m: Machine, x: int, now: int) -> None:
     """Note that an execution has been dispatched."""
     cost = s.x_cost[x]
-    begins(s, m, x, cost, load.computed[place_of(s, load, x)] if len(load.computed) > 0 else cost)
+    cpu = load.computed[place_of(s, load, x)] if len(load.computed) > 0 else cost
+    set_phases(s, m, x, cost, cpu)
 
 
-def begins(s: State, m: Machine, x: int, cost: int, cpu: int) -> None:
+def set_phases(s: State, m: Machine, x: int, cost: int, cpu: int) -> None:
     """Note the cost of a dispatched execution, and its computing parts."""
     while len(m.at) <= x:
         for column in (m.locked_until, m.computes_until, m.waits_until, m.publishes_at, m.at,
-                       m.need, m.until, m.share):
+                       m.need, m.until, m.assigned_in):
             column.append(0)
     m.publishes_at[x] = NEVER
     cpu = min(cpu, cost)
@@ -177,7 +178,7 @@ def _set_parts(m: Machine, x: int, first: int, second: int, third: int) -> None:
     m.waits_until[x] = third
 
 
-def share(s: State, m: Machine, now: int, finish_at: list[int]) -> None:
+def assign_cpus(s: State, m: Machine, now: int, finish_at: list[int]) -> None:
     """Assign the GIL and CPUs, and compute when executions finish."""
     number = m.scalars[SHARES] = m.scalars[SHARES] + 1
     m.joining.clear()
@@ -193,12 +194,12 @@ def share(s: State, m: Machine, now: int, finish_at: list[int]) -> None:
     next_time = min(m.scalars[SLICE_AT], m.scalars[OVERTAKE_AT])
     for process in range(1, len(m.switch_at)):
         next_time = min(next_time, m.switch_at[process])
-    m.still.clear()
+    m.stalled.clear()
     for worker in range(len(on)):
         x = on[worker]
         if x < 0:
             continue
-        if m.need[x] == _NOTHING or m.share[x] == number:
+        if m.need[x] == _NOTHING or m.assigned_in[x] == number:
             finish_at[worker] = s.x_started[x] + s.x_left[x]
             until = m.until[x]
             if m.publishes_at[x] < until:
@@ -207,7 +208,7 @@ def share(s: State, m: Machine, now: int, finish_at: list[int]) -> None:
                 next_time = now + until - m.at[x]
         else:
             finish_at[worker] = NEVER
-            m.still.append(x)
+            m.stalled.append(x)
     m.scalars[NEXT_TIME] = next_time
 
 
@@ -241,8 +242,8 @@ def _ask(s: State, m: Machine, x: int, interpreter: int) -> None:
         if (s.x_worker[first] < 0 and m.need[first] == _CPU
                 and s.process[s.x_vertex[first]] == s.process[s.x_vertex[x]]):
             queue[0] = x
-            if m.lock_had[interpreter] == first:
-                m.lock_had[interpreter] = x
+            if m.previous_holder[interpreter] == first:
+                m.previous_holder[interpreter] = x
             return
     queue.append(x)
 
@@ -257,8 +258,8 @@ def _pass_lock(s: State, m: Machine, process: int, now: int) -> None:
             queue[kept] = x
             kept += 1
     del queue[kept:]
-    had = m.lock_had[process]
-    m.lock_had[process] = -1
+    had = m.previous_holder[process]
+    m.previous_holder[process] = -1
     if kept < 2:
         m.switch_at[process] = NEVER
     else:
@@ -269,7 +270,7 @@ def _pass_lock(s: State, m: Machine, process: int, now: int) -> None:
                 queue[i - 1] = queue[i]
             queue[kept - 1] = had
             m.switch_at[process] = now + SWITCH_NS
-        m.lock_had[process] = queue[0]
+        m.previous_holder[process] = queue[0]
     if kept > 0:
         first = queue[0]
         m.need[first] = _CPU
@@ -295,12 +296,12 @@ def _pass_cpus(s: State, m: Machine, now: int) -> None:
     m.computing.clear()
     for i in range(wanted):
         x = m.joining[i]
-        if not turns or m.share[x] != number - 1:
+        if not turns or m.assigned_in[x] != number - 1:
             m.computing.append(x)
     if turns:
         for i in range(wanted):
             x = m.joining[i]
-            if m.share[x] == number - 1:
+            if m.assigned_in[x] == number - 1:
                 m.computing.append(x)
     for i in range(min(cpus, wanted)):
-        m.share[m.computing[i]] = number
+        m.assigned_in[m.computing[i]] = number
