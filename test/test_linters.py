@@ -93,8 +93,7 @@ def test_tests_import_helpers_and_not_each_other():
     found = [f'{path.relative_to(TOP)}: {line}' for path in sorted((TOP / 'test').rglob('*.py'))
              for line in re.findall(r'^from (?:\.\S*\.|\.+)test_\w+ import .*$',
                                     path.read_text(encoding='utf-8'), re.MULTILINE)]
-    # Its traces of several processes are being rebuilt; they become a helper then.
-    assert not [line for line in found if '.test_joining import' not in line]
+    assert not found
 
 
 def test_copyright():

@@ -50,12 +50,12 @@ from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
 from mddag_executor.rerun.run_threads import RunThreads
 from mddag_executor.simulate.machine import (
-    begins,
+    advance_machine,
+    assign_cpus,
     fill_machine,
     Machine,
     NEXT_TIME,
-    settle,
-    share,
+    set_phases,
 )
 from rclpy.exceptions import InvalidHandle
 
@@ -127,7 +127,7 @@ class Loop:
         self._state = engine.scheduler.state
         self._machine = empty(Machine)
         fill_machine(self._state, self._machine, cpus or NEVER, int(python))
-        settle(self._state, self._machine, start)
+        advance_machine(self._state, self._machine, start)
         # by worker: what runs on it, and when that ends if nothing changes
         self._running: list[Execution | None] = [None] * engine.n_workers
         self._finish_at = [NEVER] * engine.n_workers
@@ -217,7 +217,7 @@ class Loop:
 
     def _share(self) -> None:
         """Decide which executions go on, and when they end."""
-        share(self._state, self._machine, self.now, self._finish_at)
+        assign_cpus(self._state, self._machine, self.now, self._finish_at)
         for worker, execution in enumerate(self._running):
             if execution is None:  # it waits
                 self._finish_at[worker] = NEVER
@@ -249,7 +249,7 @@ class Loop:
             return False
         self.now = next_at
         self._at_once = 0
-        settle(self._state, self._machine, next_at)
+        advance_machine(self._state, self._machine, next_at)
         return True
 
     # --- callbacks -------------------------------------------------------------------------------
@@ -267,7 +267,7 @@ class Loop:
         execution = Execution(work, self.now, work.worker, work.worker + 1, release)
         is_driven = work.entity.awaiting is not None
         takes = 0 if is_driven else self._execution_time(work, origin, release)
-        begins(self._state, self._machine, work.x, 0, -1)  # for now it needs nothing
+        set_phases(self._state, self._machine, work.x, 0, -1)  # for now it needs nothing
         if not self._call(execution):
             return
         self.callbacks += 1
@@ -282,7 +282,7 @@ class Loop:
         if execution.worker >= 0 and self.now == execution.start:  # it has not waited
             state, x = self._state, work.x
             state.x_cost[x] = state.x_left[x] = takes
-            begins(state, self._machine, x, takes, work.cpu_ns)
+            set_phases(state, self._machine, x, takes, work.cpu_ns)
             self._running[work.worker] = execution
             return
         self.at(max(self.now, execution.start + takes), ENDED, self._end, execution)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ..sources.bags import write_bag
+from ..sources.of_processes import Trace, TWO
 from ..sources.recorded import four_jobs
-from ..sources.test_joining import Trace, TWO
 from . import golden
 
 GRAPH = """\
