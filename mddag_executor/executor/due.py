@@ -81,11 +81,15 @@ class Overdue:
     def __init__(self, pool: Clocked) -> None:
         self.entry: list[Any] | None = None
         self._pool = pool
+        self._engine = pool.engine
         #: ns on the trace's clock
         self.deadline = NEVER
 
-    def set(self, deadline: int) -> None:
-        """Set or cancel it."""
+    def update(self) -> None:
+        """Set it to what it is now, or cancel it."""
+        deadline = self._engine.next_deadline()
+        if deadline == self.deadline:
+            return
         self.deadline = deadline
         if deadline == NEVER:
             self._pool.agenda.cancel(self)
@@ -242,6 +246,8 @@ class DueTimes:
         :param patience: how long what waits, or may come, may wait for it.
         """
         watch, at = self._watch, now + patience
+        if now + SHORT_CALLBACK_NS <= watch.at <= at and watch.at <= self._agenda.latest:
+            return  # as nearly always; the rest is the same, but ``latest`` may be too early
         if self._agenda.latest < at:
             at = min(self._agenda.first_latest(), at)
         if at < watch.at or watch.at < now + SHORT_CALLBACK_NS:  # else it is good enough

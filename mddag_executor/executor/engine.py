@@ -79,26 +79,21 @@ class Step:
     What the threads are to do, as the engine answers; valid until the next call of the engine.
 
     :ivar work: the execution to run; None: there is none.
-    :ivar is_short: whether it usually ends soon.
+    :ivar is_short: whether it usually ends soon; this and what follows only if there is one:
     :ivar overtaken: the execution that is to pause while it runs; None: none.
-    :ivar holder: the execution that holds the interpreter and computes; None: none.
-    :ivar more: whether another thread may start an execution now.
-    :ivar n_idle: how many workers run nothing.
     :ivar patience_ns: how long what waits, or may come, may wait for a short execution to end.
-    :ivar deadline: a time at or before the next deadline of an open job, ns on the trace's clock.
+    :ivar more: whether another thread may start an execution now; this and what follows always:
+    :ivar n_idle: how many workers run nothing.
     """
 
-    __slots__ = ('work', 'is_short', 'overtaken', 'holder', 'more', 'n_idle', 'patience_ns',
-                 'deadline')
+    __slots__ = ('work', 'is_short', 'overtaken', 'more', 'n_idle', 'patience_ns')
 
     def __init__(self) -> None:
         self.work: Work | None = None
         self.overtaken: Work | None = None
-        self.holder: Work | None = None
         self.is_short = self.more = False
         self.n_idle = 0
         self.patience_ns = NET_NS
-        self.deadline = NEVER
 
 
 class Engine:
@@ -463,48 +458,39 @@ class Engine:
         :param worker: the worker to use if it is idle; else the lowest idle one is used.
         :param others_wait: whether a thread waits for events, which can start more at once.
         """
-        step, ready, held_back = self._step, self._ready, self._held_back
-        deadline = self.deadlines.next
-        bypass, holders = self._bypass, self._holders
-        if ready or held_back or bypass.queue:
-            work = step.work = self._dispatch(worker, now)
-            waits = bool(ready or held_back or bypass.queue)
-        else:
-            work = step.work = None
-            waits = False
-        if work is not None:
-            is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
-        else:
-            is_short = False
-            if deadline < NEVER:
-                deadline = self.deadlines.first()
-        step.is_short = is_short
-        step.deadline = deadline
-        step.holder = step.overtaken = None
-        if holders:
-            holder = step.holder = holders[-1]
-            if holder is work and len(holders) > 1 and self.interpreter.pauses:
-                step.overtaken = holders[-2]
-        step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
-        if waits:
-            self._advise(step, now, others_wait or not is_short)
-        else:
+        step, bypass = self._step, self._bypass
+        if not (self._ready or self._held_back or bypass.queue):  # nearly every second time
+            step.work = None
             step.more = False
+            step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
+            return step
+        work = step.work = self._dispatch(worker, now)
+        step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
+        is_short = False
+        if work is not None:
+            is_short = step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
+            holders = self._holders
+            step.overtaken = holders[-2] if (
+                len(holders) > 1 and holders[-1] is work and self.interpreter.pauses) else None
+        if self._ready or self._held_back or bypass.queue:
+            step.patience_ns = self.interpreter.patience()
+            step.more = (others_wait or not is_short) and self._may_start_more(now)
+        else:
             step.patience_ns = NET_NS
+            step.more = False
         return step
 
     def advice(self, now: int) -> Step:
         """Return what other threads are to do, after all events up to now."""
         step = self._step
-        step.work = step.overtaken = None
-        step.is_short = step.more = False
-        step.deadline = self.deadlines.next
-        step.holder = self._holders[-1] if self._holders else None
+        step.work = None
         step.n_idle = self.idle_workers
-        step.patience_ns = NET_NS
-        if self.has_waiting:
-            self._advise(step, now, True)
+        step.more = self.has_waiting and self._may_start_more(now)
         return step
+
+    def next_deadline(self) -> int:
+        """Return a time at or before the next deadline of an open job, on the trace's clock."""
+        return NEVER if self.deadlines.next == NEVER else self.deadlines.first()
 
     def patience(self) -> int:
         """
@@ -514,18 +500,10 @@ class Engine:
         """
         if self.idle_workers < 1:
             return NEVER
-        patience = self.interpreter.patience() if self.has_waiting else NET_NS
+        waits = self._ready or self._held_back or self._bypass.queue
+        patience = self.interpreter.patience() if waits else NET_NS
         # it is not known yet whether a holder really computes: half the time
         return patience // 2 if self._holders else patience
-
-    def _advise(self, step: Step, now: int, asks: bool) -> None:
-        """
-        Set what a step says about other threads, as something waits.
-
-        :param asks: whether one of them can start ``more``.
-        """
-        step.patience_ns = self.interpreter.patience()
-        step.more = asks and self._may_start_more(now)
 
     def _dispatch(self, worker: int, now: int) -> Work | None:
         if self._bypass.is_open:
@@ -542,10 +520,7 @@ class Engine:
             worker = state.worker_x.index(-1)
         if self._holders:
             state.overtaking[1] = self.interpreter.may_be_overtaken(now)
-        work = self._start_next(worker, now)
-        if work is not None and work.entity.collect_more is not None:
-            self._collect_more(work.entity)
-        return work
+        return self._start_next(worker, now)
 
     @staticmethod
     def _collect_more(entity: Entity) -> None:
@@ -571,6 +546,8 @@ class Engine:
             self._holders.append(work)
         if self._is_watched:
             self._begin_watched(work, now)
+        if entity.collect_more is not None:
+            self._collect_more(entity)
         return work
 
     def _begin_watched(self, work: Work, now: int) -> None:
@@ -693,8 +670,12 @@ class Engine:
             if self._records is not None:
                 self._records.run(work, start, end, vtid, worker)
             return
-        if self._holders:
-            self._let_go(work)
+        holders = self._holders
+        if holders:
+            if holders[-1] is work:
+                holders.pop()
+            else:
+                self._let_go(work)
         if self._is_plain and not failed and entity.awaiting is None and (
                 not self.verdicts.tally.overdue):
             x, work.x = work.x, -1

@@ -123,8 +123,12 @@ class WorkerPool:
         self.stopped_at = 0
         self.is_current = False
         self.pauses = Pauses(self)
+        self._paused = self.pauses.paused
         engine.interpreter.pauses = can_pause()
+        self._interpreter = engine.interpreter
+        self._holders = engine.interpreter.holders
         self.lending = Lending(self)
+        self._rejoining = self.lending.rejoining
         self.n_ended = 0
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None, int], bool] | None = None
@@ -476,15 +480,14 @@ class WorkerPool:
         if state is _WAITING:
             self.polling += 1
             me.waits_since = self.now
-        elif before is _WAITING:
+        elif state is _PARKED:  # a visitor never is
+            self._n_parked += 1
+        if before is _WAITING:
             self.polling -= 1
             if self._leaving and not self.polling:
                 self._all_left.set()
-        if me.thread is not None:
-            if state is _PARKED:
-                self._n_parked += 1
-            elif before is _PARKED:
-                self._n_parked -= 1
+        elif before is _PARKED:
+            self._n_parked -= 1
 
     # --- a turn ----------------------------------------------------------------------------------
 
@@ -563,7 +566,7 @@ class WorkerPool:
                     engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
                 else:
                     self._report_unusual_end(me, work, now)
-                if self.lending.rejoining and not self.running:
+                if not self.running and self._rejoining:
                     self.lending.let_go_on()
                 if work.entity.removed:
                     self.wake_executor()  # the registry can forget it now
@@ -574,7 +577,7 @@ class WorkerPool:
                 if self._verdicts.missed != self._misses:
                     self._note_misses()
             found = not is_last and self._choose(me, self.now)
-            if self.pauses.paused:
+            if self._paused:
                 self.pauses.end()
         if self.unlocked_calls:
             self._make_unlocked_calls()
@@ -619,26 +622,16 @@ class WorkerPool:
 
     def _choose(self, me: WorkerThread, now: int) -> bool:
         """Set the next execution, or where to wait; return whether there is an execution."""
-        engine, due, rejoining = self.engine, self.due, self.lending.rejoining
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
-        if self.running and not (self.is_spin_once and me.thread is not None):
-            step = engine.step(me.worker, now, self.polling > 0)
-            while rejoining and step.work in rejoining:
-                self.lending.hand_over(step)
-                step = engine.step(me.worker, now, self.polling > 0)
+        if self.running and (not self.is_spin_once or me.thread is None):
+            step = self.engine.step(me.worker, now, self.polling > 0)
+            if self._rejoining:
+                step = self._hand_over(me, step, now)
         else:
-            step = engine.advice(now)
+            step = self.engine.advice(now)
         work = step.work
         if work is None:
-            if step.deadline != due.overdue.deadline:
-                due.overdue.set(step.deadline)
-            if self._verdicts.missed != self._misses:
-                self._note_misses()
-            if me.thread is not None:  # else a visitor: the thread of a spin_once
-                self._rest(me, step)
-                if self.is_spin_once and step.more:
-                    self.call()
-            due.rest(now - self.offset)
+            self._rest(me, step, now)
             return False
         me.work = work
         me.worker = work.worker
@@ -649,17 +642,24 @@ class WorkerPool:
         if step.is_short and not self.polling and not self.is_spin_once:  # nearly always
             me.is_spare = False
             if step.n_idle:
-                due.arm_late_look(now - self.offset, step.patience_ns)
+                self.due.arm_late_look(now - self.offset, step.patience_ns)
         else:
             self._share_events(me, step, now)
         return True
 
+    def _hand_over(self, me: WorkerThread, step: Step, now: int) -> Step:
+        """Let executions go on that were dispatched again; return the step after these."""
+        while step.work in self._rejoining:
+            self.lending.hand_over(step)
+            step = self.engine.step(me.worker, now, self.polling > 0)
+        return step
+
     def _share_events(self, me: WorkerThread, step: Step, now: int) -> None:
         """Let another thread wait for events, or look for them, while one runs an execution."""
         due = self.due
-        me.is_spare = not (step.is_short or step.holder is step.work)
-        if step.deadline != due.overdue.deadline and (self.polling or not step.is_short):
-            due.overdue.set(step.deadline)  # else there is time until it ends
+        me.is_spare = not (step.is_short or self._interpreter.holder is step.work)
+        if self.polling or not step.is_short:  # else there is time until it ends
+            due.overdue.update()
         if self.is_spin_once:
             due.arm(now - self.offset)
         elif self.polling:
@@ -673,14 +673,21 @@ class WorkerPool:
             else:
                 due.arm_look(now - self.offset)
 
-    def _rest(self, me: WorkerThread, step: Step) -> None:
+    def _rest(self, me: WorkerThread, step: Step, now: int) -> None:
         """Let a thread without an execution wait for events, or park it."""
-        others = self.polling - (me.state is _WAITING)
-        # while a callback computes, its thread handles the events when it ends
-        waits = self.running and not self.is_spin_once and not self._closed and (
-            self._eager > 0 or step.holder is None) and (
-            others == 0 or me.is_spare and others < step.n_idle)
-        self.become(me, _WAITING if waits else _PARKED)
+        self.due.overdue.update()
+        if self._verdicts.missed != self._misses:
+            self._note_misses()
+        if me.thread is not None:  # else a visitor: the thread of a spin_once
+            others = self.polling - (me.state is _WAITING)
+            # while a callback computes, its thread handles the events when it ends
+            waits = self.running and not self.is_spin_once and not self._closed and (
+                self._eager > 0 or not self._holders) and (
+                others == 0 or me.is_spare and others < step.n_idle)
+            self.become(me, _WAITING if waits else _PARKED)
+            if step.more and self.is_spin_once:
+                self.call()
+        self.due.rest(now - self.offset)
 
     def threads(self) -> list[WorkerThread]:
         """Return all threads that run callbacks, from any thread."""
