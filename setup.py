@@ -149,7 +149,7 @@ setup(
         'test-kilted': [*TEST_LIVE, *ros('kilted', 'test-msgs')],
     },
     entry_points={
-        'console_scripts': ['mddag = mddag_executor.cli.main:main'],
+        'console_scripts': ['mddag = mddag_executor.__main__:main'],
         'ros2cli.command': ['mddag = mddag_executor.cli.ros2:MddagCommand'],
     },
 )

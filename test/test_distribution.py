@@ -182,7 +182,7 @@ def test_the_distributions_hold_what_they_should(built):
         entries = ConfigParser()
         entries.read_string(archive.read(f'{info}/entry_points.txt').decode())
     assert info == f'{NAME}-{__version__}.dist-info'
-    assert dict(entries['console_scripts']) == {'mddag': f'{NAME}.cli.main:main'}
+    assert dict(entries['console_scripts']) == {'mddag': f'{NAME}.__main__:main'}
     data = f'{info.removesuffix(".dist-info")}.data/data/'
     assert {n for n in names if not n.startswith((info, data))} == files_in(
         built / 'checkout', NAME, 'msg_graph')

@@ -34,14 +34,9 @@ import time
 from types import CodeType, FrameType
 from typing import Any, TypeVar
 
-from rclpy.signals import get_current_signal_handlers_options, SignalHandlerOptions
-
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = __name__.partition('.')[0]
 _MOST_FD_OF_SELECT = 1023
-_OF_RCLPY: dict[int, tuple[Any, ...]] = {
-    signal.SIGINT: (SignalHandlerOptions.ALL, SignalHandlerOptions.SIGINT),
-    signal.SIGTERM: (SignalHandlerOptions.ALL, SignalHandlerOptions.SIGTERM)}
 _FAULTS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
 _NUMBERS = tuple(
     number for number in sorted(signal.valid_signals())
@@ -172,10 +167,18 @@ class InterruptsDeferred:
 
 
 def _is_to_be_deferred(number: int, handler: Any) -> bool:
-    return handler != _deferred.handle and (
-        number not in _OF_RCLPY or get_current_signal_handlers_options() not in _OF_RCLPY[number]
-    ) and (number == signal.SIGINT  # asyncio's does nothing but to wake its loop
-           or getattr(handler, '__module__', None) != 'asyncio.unix_events')
+    return handler != _deferred.handle and not _is_of_rclpy(number) and (
+        number == signal.SIGINT  # asyncio's does nothing but to wake its loop
+        or getattr(handler, '__module__', None) != 'asyncio.unix_events')
+
+
+def _is_of_rclpy(number: int) -> bool:
+    if number not in (signal.SIGINT, signal.SIGTERM):
+        return False
+    from rclpy.signals import (  # the command line imports this module, and often no rclpy
+        get_current_signal_handlers_options, SignalHandlerOptions)
+    one = SignalHandlerOptions.SIGINT if number == signal.SIGINT else SignalHandlerOptions.SIGTERM
+    return get_current_signal_handlers_options() in (SignalHandlerOptions.ALL, one)
 
 
 @interruptible

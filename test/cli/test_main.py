@@ -88,6 +88,30 @@ def test_an_interrupt_is_quiet(verb, capsys):
     assert program.main(['probe']) == 130 and capsys.readouterr() == ('', '')
 
 
+INTERRUPTED = """
+import runpy, sys
+
+class Finder:
+    def find_spec(self, name, *more):
+        if name == 'mddag_executor.errors':
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Finder())
+runpy.run_module('mddag_executor', run_name='__main__')
+"""
+
+
+def test_an_interrupt_while_it_is_imported_is_quiet():
+    done = subprocess.run([sys.executable, '-c', INTERRUPTED], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '', '')
+
+
+def test_the_command_line_itself_imports_no_ros():
+    code = ('import mddag_executor.cli.main, sys\n'
+            'assert not {"rclpy", "numpy", "asyncio"} & {*sys.modules}')
+    subprocess.run([sys.executable, '-c', code], check=True)
+
+
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_no_incomplete_file(folder, number):
     (folder / 'g.yaml').write_text(GRAPH)
