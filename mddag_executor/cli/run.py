@@ -133,7 +133,8 @@ def _finish(args: argparse.Namespace, result: RunResult) -> int:
         return EXIT_DEFECT
     status = verdicts.exit_status(args, values, values['file'] or 'mddag run')
     traces = [values['trace'], *(each['trace'] for each in processes or () if not each['died'])]
-    return _end(result.error or _incomplete(traces) or _not_found(args, values), status)
+    missing = _not_found(args, values) if result.has_started else None
+    return _end(result.error or _incomplete(traces) or missing, status)
 
 
 def _not_found(args: argparse.Namespace, values: dict[str, Any]) -> MddagError | None:
@@ -177,7 +178,8 @@ def part(args: argparse.Namespace, given: RunOptions) -> int:
             nodes_of(given.specs, ros_arguments(given.ros_args), then, leave)
 
     def finish(result: RunResult) -> int:
-        the_part.write_result({**result.to_json(), 'observed': result.observed})
+        the_part.write_result({
+            **result.to_json(), 'observed': result.observed, 'has_started': result.has_started})
         if given.synthetic is not None and result.error is None:
             _exit(0)  # the nodes are not destroyed one by one
         return _end(result.error)

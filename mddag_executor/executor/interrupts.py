@@ -175,8 +175,8 @@ def _is_to_be_deferred(number: int, handler: Any) -> bool:
 def _is_of_rclpy(number: int) -> bool:
     if number not in (signal.SIGINT, signal.SIGTERM):
         return False
-    from rclpy.signals import (  # the command line imports this module, and often no rclpy
-        get_current_signal_handlers_options, SignalHandlerOptions)
+    # the command line imports this module, and often no rclpy
+    from rclpy.signals import get_current_signal_handlers_options, SignalHandlerOptions
     one = SignalHandlerOptions.SIGINT if number == signal.SIGINT else SignalHandlerOptions.SIGTERM
     return get_current_signal_handlers_options() in (SignalHandlerOptions.ALL, one)
 

@@ -81,7 +81,7 @@ class Run:
 
     :ivar name: of the process in the declaration.
     :ivar status: its exit status, negative for a signal; None while it runs.
-    :ivar asked: it was sent SIGTERM.
+    :ivar asked: it was sent SIGTERM, or ended when the run was to end.
     """
 
     name: str
@@ -95,9 +95,10 @@ class Run:
     @property
     def died(self) -> bool:
         """Return whether it ended by an exception, a signal or an error."""
-        # SIGTERM during its start: before `main`, before the run, or its nodes could not start
+        # SIGTERM during its start: before `main`, before the run, or its nodes could not start.
+        # The terminal's SIGINT reaches a process before that has a group of its own.
         as_asked = self.asked and self.status in (
-            -signal.SIGTERM, 128 + signal.SIGTERM, _BAD_INPUT)
+            -signal.SIGTERM, 128 + signal.SIGTERM, -signal.SIGINT, 128 + signal.SIGINT, _BAD_INPUT)
         return self.status not in (None, 0) and not as_asked
 
     @property
@@ -219,6 +220,7 @@ class Supervisor:
 
     def _ended(self, run: Run, now: float, is_over: bool) -> None:
         self._reap(run)
+        run.asked |= self._stop
         if run.status == _BAD_INPUT and not run.asked:
             raise ProcessError(f'process {run.name}: {run.said.removeprefix("error: ")}')
         self._on_end(run)

@@ -55,7 +55,7 @@ _PART_ENDS_S = 60
 # How long nodes of several processes wait for each other, once the programs have started: if the
 # run has started all of them, and if it is unknown whether the others will come.
 _MEET_S, _ALONE_S = 10.0, 4.0
-_SIGNAL = 128
+SIGNAL = 128
 """A shell adds the number of the signal that has ended a program."""
 
 
@@ -173,6 +173,7 @@ class _Run:
         self._part = part
         self._watch = Watch(executor, task_set)
         self._warnings: list[str] = []
+        self._has_started = True
 
     def _warn(self, line: str) -> None:
         self._warnings.append(line)
@@ -195,8 +196,10 @@ class _Run:
             with session:
                 host.start(executor, programs, ros_arguments(self._options.ros_args),
                            session.stop, lambda: session.stopped)
-                if signals.ended_by is not None and not any(g.has_begun for g in host.guests):
-                    raise SystemExit(_SIGNAL + signals.ended_by)  # as if it had come before
+                if signals.ended_by is not None:
+                    if not any(guest.has_begun for guest in host.guests):
+                        raise SystemExit(SIGNAL + signals.ended_by)  # as if it had come before
+                    self._has_started = False
                 executor.set_judging(True, self._begin_of_several())
                 session.wait(self._options.seconds)
         except MddagError as error:
@@ -292,7 +295,8 @@ class _Run:
         return RunResult(
             values, tuple(_end_of(guest) for guest in guests), tuple(self._warnings),
             _with_place(error, values, guests),
-            None if self._part is None else asdict(self._watch.observed(counts)))
+            None if self._part is None else asdict(self._watch.observed(counts)),
+            self._has_started)
 
 
 def _end_of(guest: Guest) -> ProgramEnd:
@@ -304,7 +308,7 @@ def _end_of(guest: Guest) -> ProgramEnd:
         return ProgramEnd(spec, error.code, '') if isinstance(error.code, int) else (
             ProgramEnd(spec, 1, str(error.code)))
     if isinstance(error, KeyboardInterrupt):
-        return ProgramEnd(spec, _SIGNAL + signal.SIGINT)
+        return ProgramEnd(spec, SIGNAL + signal.SIGINT)
     return ProgramEnd(spec, 0 if error is None else 1, '' if error is None else describe(error))
 
 

@@ -29,7 +29,7 @@ from mddag_executor.hosting.processes import (
     Run,
     Supervisor,
 )
-from mddag_executor.hosting.run_here import Display, plan_of, warn_of
+from mddag_executor.hosting.run_here import Display, plan_of, SIGNAL, warn_of
 from mddag_executor.hosting.run_options import RunOptions, spec_of
 from mddag_executor.hosting.run_result import RunResult
 from mddag_executor.hosting.signals import Signals
@@ -94,6 +94,10 @@ def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> R
                     remove_recording(trace)
             raise
         parts = [read_result(folder, run.process.pid) for run in supervisor.runs]
+        has_started = signals.ended_by is None or all(
+            part is not None and part['has_started'] for part in parts)
+        if signals.ended_by is not None and not any(parts):  # as if it had come before
+            raise SystemExit(SIGNAL + signals.ended_by)
     results = {run.name: each for run, each in zip(supervisor.runs, parts) if each is not None}
     return RunResult({
         'file': task_set.file, 'nodes': options.specs, 'synthetic': options.synthetic,
@@ -107,7 +111,8 @@ def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> R
             'said': run.said if run.died else None,
             'trace': _trace_of_dead(_trace(options.trace, run.name)) if part is None
             else part['trace']}
-            for run, part in zip(supervisor.runs, parts)]}, warnings=tuple(warnings))
+            for run, part in zip(supervisor.runs, parts)]},
+        warnings=tuple(warnings), has_started=has_started)
 
 
 def _warn_of_divided_paths(task_set: TaskSet, warn: Callable[[str], None]) -> None:

@@ -41,6 +41,7 @@ class RunResult:
     :ivar warnings: lines about the run, each with what to do.
     :ivar error: what a node raised; ``hosting.run`` raises it.
     :ivar observed: what several processes put together.
+    :ivar has_started: False: a signal has ended it before all of its programs had started.
     """
 
     values: dict[str, Any]
@@ -48,6 +49,7 @@ class RunResult:
     warnings: tuple[str, ...] = ()
     error: BaseException | None = None
     observed: Mapping[str, Any] | None = None
+    has_started: bool = True
 
     @property
     def dags(self) -> dict[str, runs.DividedDag]:

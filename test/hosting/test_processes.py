@@ -174,6 +174,21 @@ def test_programs_run_in_the_process_of_their_nodes(world):
     assert '/mddag/jobs' not in drafted
 
 
+def test_an_end_while_processes_start_is_quiet(world):
+    """As if it had come to a run that has not begun."""
+    (world / 'slow.py').write_text(
+        'import pathlib, time\n'
+        'pathlib.Path("begun").touch()\n'
+        'time.sleep(60)\n')
+    with running('graph.yaml', '--node', 'up=slow:first', '--node', 'down=slow:last',
+                 '--trace', 'out.mcap') as run:
+        wait_for_run(run, (world / 'begun').exists)
+        run.send_signal(signal.SIGINT)
+        said = run.communicate(timeout=60)
+    assert (run.returncode, *said) == (130, '', '')
+    assert not list(world.glob('*.mcap')) and not (world / 'result.json').exists()
+
+
 def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
     with running('graph.yaml', *NODES, '--on-exit', 'continue', '--trace', 'out.mcap') as run:
         wait_for_run(run, (world / 'enough').exists)

@@ -92,6 +92,17 @@ def test_a_process_that_does_not_end_is_asked_then_killed(
         *['warning: process a has not ended within 0.1 s: it is killed'] * is_killed]
 
 
+def test_a_process_that_the_terminal_interrupts_at_its_start_has_not_died(tmp_path):
+    """It gets the SIGINT that ends the run, if it has no group of its own yet."""
+    interrupted = WAITS.replace(
+        'lambda *_: end.set()', 'lambda *_: signal.raise_signal(signal.SIGINT)').replace(
+        'end = ', 'signal.signal(signal.SIGINT, signal.SIG_DFL)\nend = ')
+    case = Case(tmp_path, a=interrupted, b=WAITS)
+    threading.Thread(
+        target=lambda: wait_for(case.mark.exists, 60.0) and case.supervisor.stop()).start()
+    assert ('a', -signal.SIGINT) in case.run() and not case.died
+
+
 # --- a function in a process of its own ----------------------------------------------------------
 
 
