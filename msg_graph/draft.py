@@ -37,7 +37,7 @@ from dataclasses import dataclass, field
 
 from msg_graph.blanks import MARK
 from msg_graph.derive import loads
-from msg_graph.duration import exact_duration, format_duration, MICROSECOND
+from msg_graph.duration import exact_duration, format_duration, MICROSECOND, SECOND
 from msg_graph.errors import GraphError, printable
 from msg_graph.language import PATH
 from msg_graph.model import ExecutionTime, ReleaseFrom
@@ -70,7 +70,9 @@ class DraftCallback:
     :ivar judged: of a sink: False if it has no deadline.
     :ivar driven_by: of a sync of different rates, the topic of ``started_by`` that drives it.
     :ivar why: of a proposed ``driven_by``, a comment with the reason.
-    :ivar least_interval_ns: if the times between its executions are irregular, the least of them.
+    :ivar least_interval_ns: if the times between its executions are irregular, or it is a service,
+        the least of them.
+    :ivar came_once: whether it ran only once in a long recording, as for a latched topic.
     :ivar stores: whether it seems to only store its message: it is short and publishes nothing.
     """
 
@@ -95,6 +97,7 @@ class DraftCallback:
     driven_by: str | None = None
     why: str = ''
     least_interval_ns: int | None = None
+    came_once: bool = False
     stores: bool = False
 
     @property
@@ -112,7 +115,9 @@ class DraftCallback:
     @property
     def source_period_ns(self) -> int | None:
         """Return the time between two releases if this is a source, if known."""
-        return self.interval_ns if self.period_ns is None else self.period_ns
+        if self.came_once and self.period_ns is None:
+            return SECOND
+        return self.period_ns or self.least_interval_ns or self.interval_ns
 
 
 @dataclass
@@ -388,9 +393,15 @@ class _Writer:
         elif callback.least_interval_ns is not None:
             yield self._proposal(
                 f'period: {_rounded(callback.least_interval_ns)}', what,
-                'the least measured time between two of its executions, which are irregular')
+                'the least measured time between two of its executions'
+                + ('' if is_service else ', which are irregular'))
+            yield self._proposal(
+                'sporadic: true', 'whether it has no fixed rate',
+                'requests come when they are needed' if is_service else 'its rate is irregular')
+        elif callback.came_once:
+            yield self._proposal('period: 1s', what, 'it ran only once')
             yield self._proposal('sporadic: true', 'whether it has no fixed rate',
-                                 'its rate is irregular')
+                                 'it ran only once')
         elif callback.interval_ns is not None:
             yield self._proposal(
                 f'period: {_rounded(callback.interval_ns)}', what, _measured(callback))
@@ -414,7 +425,7 @@ class _Writer:
         source = self._fastest.get(callback.key)
         if source is None:
             return _blank('deadline: 100ms', f'{what}; no source with a known period leads here')
-        period = (_rounded(source.interval_ns or 0) if source.period_ns is None
+        period = (_rounded(source.source_period_ns or 0) if source.period_ns is None
                   else _whole(source.period_ns))
         kind = 'timer' if source.kind == 'timer' else 'source'
         return self._proposal(

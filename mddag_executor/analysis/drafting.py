@@ -6,14 +6,17 @@ Drafts systems from traces: nodes, callbacks, published topics, rates, execution
 Theory of operation
 -------------------
 1. The tables of the recording have the executions and publications.  Entities of every node
-   (parameter services and the like) are ignored, and so are nodes without others.
+   (parameter services and the like) and the timers of ``Rate`` are ignored, and so are nodes
+   without others.
 2. A coroutine is one execution, however often it was resumed.
 3. A callback in the recorded declaration keeps its name and the declared properties that a trace
    does not show: deadline, queue edges, period, sync, group, name of the DAG, and topics that
    nothing published.  Other callbacks are named by their recorded function, otherwise
    ``callback_0``, ``callback_1``, … by node, in the order of creation.
 4. A topic of a node is published by the callbacks that were seen to publish it. If none was, every
-   callback of the node may publish it; for a node without callbacks a timer is assumed.
+   callback of the node may publish it; for a node without callbacks a timer is assumed.  If each
+   subscription received at most one message, the topic is latched: the node published it when it
+   was made, and its subscribers are sporadic sources.
 5. A service without calls, and a subscription without messages whose topic no callback publishes,
    have no rate, so they cannot be the source of a DAG.  They are left out and reported.
 6. A timer that was made after another one of its node, with the same period and function, had
@@ -56,6 +59,9 @@ COPIED_SHARE = 0.9
 STORES_NS = 500_000
 """A callback that only stores its message takes no longer in nine of ten executions."""
 IRREGULAR = 3
+_LONG_NS = 2_000_000_000
+"""One message in at least this time has no rate."""
+_OF_RATE = 'threading.Event.set'    # the callback of the timer of a ``Rate``
 """Times between executions are irregular if the 90 % quantile is this many times the 10 % one."""
 ONCE_PERIODS = 3
 """A timer fires once if it was silent for this many periods after its only execution."""
@@ -227,10 +233,12 @@ class System:
             callback = self._callback(entity, node)
             node.callbacks.setdefault(callback.name, callback)
         self._keep_declared_topics(nodes)
+        latched = self._latched(nodes)
         for name, topics in self._publishers.items():
             drafted = nodes[name].callbacks if name in nodes else {}
             known = {topic for each in drafted.values() for topic in each.publishes}
             unseen = [t for t, seen in topics.items() if not seen and t not in known
+                      and t not in latched
                       and not is_side_output(t, name) and TOPIC.fits(t)]
             if unseen and not drafted and NODE.fits(name):
                 timer = DraftCallback(name, 'callback_0', 'timer')
@@ -253,6 +261,15 @@ class System:
             'it never fired, so it was cancelled, or reset each time before')
         draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
         return draft
+
+    @staticmethod
+    def _latched(nodes: dict[str, DraftNode]) -> set[str]:
+        """Return the topics that no subscription received more than once (rule 4)."""
+        every = [callback for node in nodes.values() for callback in node.callbacks.values()
+                 if callback.kind == 'subscription' and callback.runs]
+        once = {topic for each in every if each.came_once for topic in each.started_by}
+        return once.difference(
+            topic for each in every if not each.came_once for topic in each.started_by)
 
     def _keep_declared_topics(self, nodes: dict[str, DraftNode]) -> None:
         """Keep declared topics that no callback has published: the recording may be too short."""
@@ -414,9 +431,13 @@ class System:
         else:
             callback.interval_ns = int(np.ptp(runs.starts)) // (count - 1) if count > 1 else None
             between = np.sort(np.diff(np.sort(runs.starts)))
-            if count > IRREGULAR and callback.kind != 'timer' and (
-                    between[len(between) * 9 // 10] > IRREGULAR * between[len(between) // 10]):
+            # a client sends a request when it needs one
+            if count > 1 and callback.kind == 'service' or (
+                    count > IRREGULAR and callback.kind != 'timer'
+                    and between[len(between) * 9 // 10] > IRREGULAR * between[len(between) // 10]):
                 callback.least_interval_ns = max(1_000, int(between[0]))
+            elif count == 1 and callback.kind != 'timer' and self._length > _LONG_NS:
+                callback.came_once = True
             callback.times = execution_time(runs.times)
         return True
 
@@ -476,7 +497,7 @@ def _find_stores(node: DraftNode) -> None:
             callback.kind == 'subscription' and not callback.publishes
             and callback.times is not None
             and callback.times[0].draw(0.9) <= STORES_NS
-            and any(each.publishes for each in others))
+            and any(each.publishes or each.kind == 'service' for each in others))
 
 
 def _runs_of(recording: Recording, which: Ints) -> Runs:
@@ -500,10 +521,11 @@ def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:
 
 
 def _is_shown(entity: Callback) -> bool:
+    """Return whether an entity is a callback of the user's (rule 1)."""
     if not NODE.fits(entity.node_name):
         return False
     if entity.kind == 'timer':
-        return entity.period >= 1_000
+        return entity.period >= 1_000 and entity.symbol != _OF_RATE
     name = TOPIC if entity.kind == 'subscription' else SERVICE
     return not is_background(entity.start, entity.node_name) and name.fits(entity.start)
 

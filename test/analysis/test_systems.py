@@ -9,7 +9,7 @@ from mddag_executor.analysis.drafting import System
 from mddag_executor.errors import InputError
 from msg_graph import loads
 from msg_graph.blanks import MARK
-from msg_graph.draft import declaration_of, Draft, DraftCallback, DraftNode, LEFT_OUT
+from msg_graph.draft import accept, declaration_of, Draft, DraftCallback, DraftNode, LEFT_OUT
 import pytest
 
 from ..sources.helpers import MS, Written
@@ -123,6 +123,35 @@ def test_names_periods_and_what_no_one_declares(tmp_path):
         '50ms', '33.333ms', '33.3ms', '1.5us', '20ms']
     assert re.findall(r'service: (.*)', text) == ['/cam/ask/get_state']
     assert 'transition_event' not in text
+
+
+def test_what_comes_when_it_is_needed_is_sporadic(tmp_path):
+    """Requests, and a latched topic, which a node publishes before its callbacks run."""
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(100, '/maps')
+    r.node(300, '/planner')
+    r.publisher(110, 100, '/map')
+    r.timer(1, 100, 100 * MS)
+    r.timer(2, 100, 50 * MS)
+    r.add('ros2:rclcpp_callback_register', 0, 1, 2, 'threading.Event.set')    # of a Rate
+    r.subscription(230, 300, '/map')
+    service(r, 260, 300, '/plan')
+    for k in range(40):
+        ran(r, 1, 1, 1_000 * MS + 100 * MS * k, MS)
+        if k % 10 == 0:
+            ran(r, 261, 2, 1_003 * MS + 100 * MS * k, 5 * MS)
+    ran(r, 230, 3, 1_002 * MS, 1_000)
+    system = System(r.write())
+    text = declaration_of(system.draft())
+    assert 'which callback publishes' not in text and 'timer: 50ms' not in text
+    assert LEFT_OUT not in text
+    draft = system.draft()
+    accept(draft)
+    map_, plan = loads(declaration_of(draft, accepted=True)).callbacks[1:]
+    assert (map_.topics, map_.period_ns, map_.sporadic, map_.judged) == (
+        ('/map',), 1_000 * MS, True, False)
+    assert (plan.service, plan.period_ns, plan.sporadic, plan.deadline_ns) == (
+        '/plan', 1_000 * MS, True, 1_000 * MS)
 
 
 def test_what_is_no_system(tmp_path):
