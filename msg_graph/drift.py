@@ -84,9 +84,10 @@ class Observed:
     :ivar duration_ns: how long it was watched.
     :ivar end_ns: until when, on the clock of the releases; 0: unknown.
     :ivar releases: the releases of each DAG, by the key of its source callback.
-    :ivar got: by callback, the number of its messages or of its timer's releases.
-    :ivar ran: by callback, the number of its executions.
-    :ivar came: by sync, the topics that it got messages of; a sync that is missing is not checked.
+    :ivar messages: by callback, the number of its messages or of its timer's releases.
+    :ivar executions: by callback, the number of its executions.
+    :ivar topics_received: by sync, the topics that it got messages of; a sync that is missing is
+        not checked.
     :ivar publishes: by callback, the topics that it published, declared or not.
     :ivar nodes: the nodes that were seen; None if unknown.
     :ivar undeclared: the undeclared entities that were seen.
@@ -96,9 +97,9 @@ class Observed:
 
     duration_ns: int = 0
     releases: dict[str, Releases] = field(default_factory=dict)
-    got: dict[str, int] = field(default_factory=dict)
-    ran: dict[str, int] = field(default_factory=dict)
-    came: Mapping[str, Set[str]] = field(default_factory=dict)
+    messages: dict[str, int] = field(default_factory=dict)
+    executions: dict[str, int] = field(default_factory=dict)
+    topics_received: Mapping[str, Set[str]] = field(default_factory=dict)
     publishes: dict[str, Set[str]] = field(default_factory=dict)
     nodes: Set[str] | None = None
     undeclared: Sequence[Entity] = ()
@@ -183,11 +184,11 @@ def may_run_elsewhere(
 
 
 def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:
-    ran = observed.ran.get(callback.key, 0)
+    ran = observed.executions.get(callback.key, 0)
     topic = None
     if ran and callback.kind == 'sync':
-        came = observed.came.get(callback.key, callback.topics)
-        topic = next((each for each in callback.topics if each not in came), None)
+        received = observed.topics_received.get(callback.key, callback.topics)
+        topic = next((each for each in callback.topics if each not in received), None)
     if ran and topic is None or not dags:
         return None
     slowest = min(dag.period_ns for dag in dags)
@@ -196,7 +197,7 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
     if observed.duration_ns < 2 * slowest + latest:
         return None
     due = _due_by_runs(callback, dags, observed)
-    if topic is None and (observed.got.get(callback.key, 0) or due is not None and due < 2):
+    if topic is None and (observed.messages.get(callback.key, 0) or due is not None and due < 2):
         return None     # the callbacks before it, or its own executions, were late or dropped
     text = (f'{callback.key} never {"ran" if topic is None else f"got a message of {topic}"} in '
             f'the {observed.duration_ns / 1e9:.3f} s after the first release')
@@ -250,19 +251,20 @@ def _due_by_runs(
     """
     before = {each.callback.key: (each, vertices)
               for each, vertices in _publishers(callback, dags, always)}
-    if not before or not before.keys() <= observed.ran.keys():
+    if not before or not before.keys() <= observed.executions.keys():
         return None
     if any(vertex.callback.driven_by is not None for vertex, _ in before.values()):
         return None     # not each of its executions publishes
     # a sync runs once for each leg, and publishes once
-    return sum(observed.ran[key] // max(1, len(legs_of(*each))) for key, each in before.items())
+    return sum(observed.executions[key] // max(1, len(legs_of(*each)))
+               for key, each in before.items())
 
 
 def _message_rate(
     callback: Callback, dags: list[Dag], observed: Observed, is_certain: bool
 ) -> Drift | None:
     expected = most = _due_by_runs(callback, dags, observed)
-    got = observed.got.get(callback.key, 0)
+    got = observed.messages.get(callback.key, 0)
     if most is not None and got < most:
         expected = _due_by_runs(callback, dags, observed, always=True)
         if expected is not None and got > expected:

@@ -52,9 +52,9 @@ class Watch:
         return Observed(
             duration_ns=max(0, end - first), end_ns=end,
             releases=dict(zip(sources, self._releases)),
-            got={key: count['ready'] for key, count in counts.items()},
-            ran={key: count['ran'] for key, count in counts.items()},
-            came={**self._executor._registry.received()},
+            messages={key: count['ready'] for key, count in counts.items()},
+            executions={key: count['ran'] for key, count in counts.items()},
+            topics_received={**self._executor._registry.received()},
             publishes={**self._executor._registry.bindings.published()},
             nodes={key.rpartition(':')[0] for key in counts},
             undeclared=self._executor._registry.bindings.undeclared())

@@ -366,13 +366,14 @@ def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
 def _observed(task_set: TaskSet, results: Results) -> Observed:
     """Return the observations of the whole system: releases, where they happened."""
     parts = {name: result['observed'] for name, result in results.items()}
-    got, ran = Counter[str](), Counter[str]()
+    messages, executions = Counter[str](), Counter[str]()
     publishes: dict[str, set[str]] = {}
-    came: dict[str, set[str]] = {}
+    received: dict[str, set[str]] = {}
     for part in parts.values():
-        got.update(part['got'])
-        ran.update(part['ran'])
-        for found, here in ((publishes, part['publishes']), (came, part['came'])):
+        messages.update(part['messages'])
+        executions.update(part['executions'])
+        for found, here in ((publishes, part['publishes']),
+                            (received, part['topics_received'])):
             for key, topics in here.items():
                 found.setdefault(key, set()).update(topics)
     releases = {}
@@ -383,5 +384,6 @@ def _observed(task_set: TaskSet, results: Results) -> Observed:
     return Observed(
         duration_ns=max((part['duration_ns'] for part in parts.values()), default=0),
         end_ns=max((part['end_ns'] for part in parts.values()), default=0),
-        releases=releases, got=got, ran=ran, came=came, publishes={**publishes},
+        releases=releases, messages=messages, executions=executions,
+        topics_received=received, publishes={**publishes},
         undeclared=[Entity(*each) for part in parts.values() for each in part['undeclared']])

@@ -36,7 +36,7 @@ def observed(jobs=50, period=10 * MS):
         duration_ns=jobs * period,
         releases={'/a:t': Releases(jobs, 7, 7 + (jobs - 1) * period),
                   '/a:y': Releases(ys, 3, 3 + (ys - 1) * 2 * period)},
-        got=dict(counts), ran=dict(counts),
+        messages=dict(counts), executions=dict(counts),
         publishes={'/a:t': {'/x', '/rosout'}, '/a:y': {'/y'}, '/b:m': {'/z'}})
 
 
@@ -50,7 +50,7 @@ def released(factor):
 
 
 def never_ran(*names):
-    return {'ran': dict.fromkeys(names, 0), 'got': dict.fromkeys(names, 0)}
+    return {'executions': dict.fromkeys(names, 0), 'messages': dict.fromkeys(names, 0)}
 
 
 NO_E = "/b:e never ran in the 0.500 s after the first release: did you mean the topic '/zz'?"
@@ -71,8 +71,8 @@ WHEN_NEEDED = "if it is made, reset or cancelled when needed, declare 'sporadic:
     (released(0.81), []), (released(1.19), []),
     (released(0.79), ['/a:t was released every 7.9ms, and 10ms is declared']),
     (released(1.21), [f'/a:t was released every 12.1ms, and 10ms is declared: {WHEN_NEEDED}']),
-    ({'got': {'/b:m': 39}}, []), ({'got': {'/b:m': 60}}, []),
-    *(({'got': {'/b:m': got}}, [
+    ({'messages': {'/b:m': 39}}, []), ({'messages': {'/b:m': 60}}, []),
+    *(({'messages': {'/b:m': got}}, [
         f'/b:m got {got} messages, and by the declaration 50 were due' + (
             f": if /a:t published /x in {got} of 50 runs, declare 'may_publish: [/x]'"
             if got < 50 else '')])
@@ -81,11 +81,11 @@ WHEN_NEEDED = "if it is made, reset or cancelled when needed, declare 'sporadic:
     (never_ran('/b:m', '/b:s', '/b:e'), ['/b:m never ran in the 0.500 s after the first release']),
     (never_ran('/b:s', '/b:e'), [NO_E.replace('e', 's', 1), NO_E]),
     # Releases and messages that an overload skips and drops are not drift.
-    ({'ran': SKIPPED | {'/b:m': 1}, 'got': {'/b:m': 20, '/b:e': 0}}, []),
-    ({'ran': SKIPPED, 'got': {'/b:m': 20, '/b:e': 0}}, [NO_E]),
-    ({'ran': SKIPPED, 'got': {'/b:m': 20, '/b:e': 15}}, []),
-    ({'came': {'/b:s': {'/x', '/z'}}}, []),
-    ({'came': {'/b:s': {'/x'}}},
+    ({'executions': SKIPPED | {'/b:m': 1}, 'messages': {'/b:m': 20, '/b:e': 0}}, []),
+    ({'executions': SKIPPED, 'messages': {'/b:m': 20, '/b:e': 0}}, [NO_E]),
+    ({'executions': SKIPPED, 'messages': {'/b:m': 20, '/b:e': 15}}, []),
+    ({'topics_received': {'/b:s': {'/x', '/z'}}}, []),
+    ({'topics_received': {'/b:s': {'/x'}}},
      ["/b:s never got a message of /z in the 0.500 s after the first release: did you mean the "
       "topic '/zz'?"]),
 ])
@@ -100,7 +100,7 @@ def test_each_difference(changes, texts):
 def test_a_result_has_what_its_text_says():
     seen = observed()
     seen.releases |= released(2)['releases']
-    seen.got['/b:w'], seen.came = 3, {'/b:s': {'/x'}}
+    seen.messages['/b:w'], seen.topics_received = 3, {'/b:s': {'/x'}}
     assert [tuple(each.result().values())[:5] for each in drift(TASKS, seen)] == [
         ('rate', '/a:t', None, 10 * MS, 20 * MS), ('rate', '/b:w', None, 25, 3)]
     del seen.releases['/a:t']
@@ -110,7 +110,7 @@ def test_a_result_has_what_its_text_says():
 
 def test_few_messages_and_short_runs_prove_nothing():
     seen = observed(jobs=9)
-    seen.got['/b:m'] = 3
+    seen.messages['/b:m'] = 3
     assert drift(TASKS, seen) == []
     for ms, never_ran in ((24, []), (25, ['/a:t']), (45, ['/a:t', '/a:y'])):
         found = drift(TASKS, Observed(duration_ns=ms * MS))
@@ -148,7 +148,8 @@ nodes:
 
     def texts(got):
         return [each.text for each in drift(tasks, Observed(
-            duration_ns=2_000 * MS, got={'/b:keep': got}, ran={**ran, '/b:keep': got}))]
+            duration_ns=2_000 * MS, messages={'/b:keep': got},
+            executions={**ran, '/b:keep': got}))]
 
     assert texts(21) == texts(120) == texts(220) == []
     assert texts(5) == [
@@ -177,7 +178,8 @@ def test_a_sync_publishes_once_for_all_messages_of_a_job():
 def test_what_may_run_in_another_process():
     text = TASKS.text.replace('dag: y}', 'dag: y, release_from: header_stamp}')
     seen = observed()
-    seen.ran['/b:w'] = seen.got['/b:w'] = seen.ran['/b:e'] = seen.got['/b:e'] = 0
+    for key in ('/b:w', '/b:e'):
+        seen.executions[key] = seen.messages[key] = 0
     for seen.nodes, never_ran in (({'/a'}, ['/b:e']), ({'/a', '/b'}, ['/b:e', '/b:w'])):
         assert [each.callback for each in drift(loads(text), seen)] == never_ran
 
