@@ -35,6 +35,29 @@ def epoch_offset_ns(enough_ns: int = 0) -> int:
     return min(readings)[1]
 
 
+LEAST_STEP_NS = 5_000_000
+"""A smaller change of the system clock is not a step."""
+SLEWED = 1_000
+"""A clock that is slewed gains or loses less than this part of the time."""
+
+
+class SystemClock:
+    """Notices when the system clock is set: by a user, by NTP, or after a machine has slept."""
+
+    def __init__(self) -> None:
+        self._offset, self._at = epoch_offset_ns(), time.monotonic_ns()
+
+    def step(self) -> int:
+        """Return by how much it was set forward since the last call, ns; 0: it was not set."""
+        now = time.monotonic_ns()
+        if abs(time.time_ns() - now - self._offset) < LEAST_STEP_NS:
+            return 0
+        before, self._offset = self._offset, epoch_offset_ns(2_000)
+        slewed, self._at = (now - self._at) // SLEWED, now
+        step = self._offset - before
+        return step if abs(step) >= LEAST_STEP_NS + slewed else 0
+
+
 class TraceClock:
     """The clock of a run's trace: ns since the epoch, and steady during the run."""
 

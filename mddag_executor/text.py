@@ -23,3 +23,10 @@ def listed(names: Collection[str], most: int = 5) -> str:
     """Return the first names of a list, and how many more there are."""
     more = len(names) - most
     return ', '.join(islice(names, most)) + (f', … ({more} more)' if more > 0 else '')
+
+
+def step_text(step: int) -> str:
+    """Return a line about a step of the system clock, by so many ns forward."""
+    return (f'the system clock was set {"forward" if step > 0 else "back"} by '
+            f'{abs(step) / 1e9:.3f} s during the run: timers and stamps go by it, so results '
+            'around that time are not those of the program: set the clock before the run')

@@ -21,10 +21,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from time import monotonic_ns, process_time_ns
 from typing import Any, Protocol
 
-from mddag_executor.clocks import TraceClock
+from mddag_executor.clocks import SystemClock, TraceClock
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
@@ -40,6 +41,8 @@ from mddag_executor.executor.holder_check import HolderCheck, Threads
 from mddag_executor.executor.loop import EventLoop, Parking
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
+from mddag_executor.text import step_text
+from rclpy.logging import get_logger
 
 
 class Clocked(Threads, Protocol):
@@ -73,6 +76,10 @@ class Call:
     def come_due(self) -> None:
         """Let the function be called."""
         self._unlocked_calls.append(self._function)
+
+
+def _warn_of_step(step: int) -> None:
+    get_logger('mddag_executor').warning(step_text(step))
 
 
 class Overdue:
@@ -125,6 +132,7 @@ class DueTimes:
         self._allowance = NEVER
         self._offset = pool.clock.offset_ns
         self._check_context_at = 0
+        self._system_clock = SystemClock()
         self._rested_at = 0
         self.overdue = Overdue(pool)
         self.check = HolderCheck(pool, self._offset, self.arm_by)
@@ -156,6 +164,9 @@ class DueTimes:
         self._notice_stop(monotonic, since)
         if monotonic > self._check_context_at:  # a context that was only destroyed is not reported
             self._check_context_at = monotonic + 20 * AGAIN_NS
+            if step := self._system_clock.step():
+                pool.engine.clock_was_set(step, now)
+                pool.unlocked_calls.append(partial(_warn_of_step, step))
             if is_over(pool.context):
                 pool.wake_executor()
         self._timer.at = NEVER

@@ -32,7 +32,9 @@ that times never decrease.  The engine and ``other_processes`` change the core's
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
+from threading import get_native_id
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
@@ -70,6 +72,7 @@ from msg_graph import TaskSet
 if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
 
+KEEP_STEPS = 100
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most this many releases are judged one by one."""
 
@@ -137,6 +140,8 @@ class Engine:
             record, self.tables, self.scheduler.state)
         self.on_late = on_late
         self.undeclared = 0
+        #: The last steps of the system clock: when, and by how much it was set forward.
+        self.clock_steps: deque[tuple[int, int]] = deque(maxlen=KEEP_STEPS)
         # entities whose executions a callback group has refused
         self._to_ask_again: list[Entity] = []
         self._state = self.scheduler.state
@@ -868,6 +873,12 @@ class Engine:
     def machine_stopped(self, begin: int, end: int) -> None:
         """Note that the machine stood still; with equal times: that it has not so far."""
         self.verdicts.machine_stopped(begin, end)
+
+    def clock_was_set(self, step: int, now: int) -> None:
+        """Note that the system clock was set forward by so much."""
+        self.clock_steps.append((now, step))
+        if self.record is not None:
+            self.record('clock_step', now, get_native_id(), step)
 
     def judge_overdue(self, now: int) -> None:
         """Report the sinks whose deadlines are over and which have not completed."""

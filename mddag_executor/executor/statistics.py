@@ -51,6 +51,7 @@ def statistics(
         'callbacks': callbacks, 'undeclared': undeclared,
         'dropped': {n: c['dropped'] for n, c in callbacks.items() if c['dropped']},
         'unfinished': running,
+        'clock_steps': [{'at_ns': at, 'step_ns': step} for at, step in engine.clock_steps],
         'queue': waiting, 'idle_workers': idle, 'lent': pool.lending.n_lent,
         'unattributed': {
             'unknown': engine.attribution.unknown,

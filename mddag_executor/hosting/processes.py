@@ -351,6 +351,8 @@ def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
         **{key: sum(part[key] for part in parts)
            for key in ('undeclared', 'queue', 'idle_workers', 'lent')},
         'unfinished': [each for part in parts for each in part['unfinished']],
+        # of one machine each process notices the same ones
+        'clock_steps': max((part['clock_steps'] for part in parts), key=len, default=[]),
         'dropped': {name: c['dropped'] for name, c in callbacks.items() if c['dropped']},
         'unattributed': {key: sum(part['unattributed'][key] for part in parts)
                          for key in ('unknown', 'doubtful')},

@@ -12,7 +12,7 @@ strange      events that make no sense, or contradict others: they are left out
 open         executions whose start is not recorded
 end          processes whose end is not recorded
 empty        the recording, if no job was released in it
-clock        groups of processes whose clock differs from that of the first one
+clock        groups of processes whose clock differs from that of the first one; steps of the clock
 callbacks    declared callbacks or DAGs that are not recorded
 stamps       releases by another stamp or time than the declared one
 unjudged     jobs that are not judged

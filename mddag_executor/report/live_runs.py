@@ -12,6 +12,7 @@ from mddag_executor.core.tally import counts, total
 from mddag_executor.report.tables import (
     drift_lines,
     guessed_lines,
+    MOST_LINES,
     never_due_lines,
     percent,
     requirement_table,
@@ -20,7 +21,7 @@ from mddag_executor.report.tables import (
     verdicts_line,
 )
 from mddag_executor.report.text import listed, printable
-from mddag_executor.text import counted
+from mddag_executor.text import counted, step_text
 
 _DECLARED_KINDS = ('timer', 'subscription', 'service')
 SHOWN_NS = 10_000_000
@@ -41,6 +42,8 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
         yield (f'{stops["misses"]} of {total(result["dags"]).missed} misses '
                f'are due to {counted(stops["count"], "stop")} ({stops["total_ns"] / 1e9:.2f} s), '
                'in which no thread of this process ran')
+    for each in result['clock_steps'][:MOST_LINES]:
+        yield step_text(each['step_ns'])
     yield from unfinished_lines(result['unfinished'])
     yield from never_due_lines(result['dags'])
     if 'processes' in result:

@@ -18,6 +18,15 @@ from mddag_executor.results.sinks import (
 )
 
 
+class ClockStep(TypedDict):
+    """The system clock was set during a run."""
+
+    at_ns: int
+    """When that was noticed, ns since the epoch by the clock as it was at the begin of the run."""
+    step_ns: int
+    """By how much it was set forward; negative: back."""
+
+
 class Stop(TypedDict):
     """A time in which no thread of the process ran, ns since the epoch."""
 
@@ -124,6 +133,8 @@ class ExecutorState(TypedDict):
     """By callback how many messages or releases did not run, if any."""
     unfinished: list[UnfinishedRun]
     """Executions that have not ended: that run, or are suspended."""
+    clock_steps: list[ClockStep]
+    """Steps of the system clock, the last 100."""
     queue: int
     """Ready executions that wait."""
     idle_workers: int

@@ -53,6 +53,8 @@ from msg_graph.yamltext import parse_yaml, plain
 import numpy as np
 import zstandard
 
+SET_BACK_NS = 1_000_000_000
+"""Messages of several threads are written in nearly the order of their arrivals."""
 _ABOUT = 'rosbag2_bagfile_information'
 _METADATA_LIMIT = 4 * 1024 * 1024
 _MESSAGE_LIMIT = 1 << 30    # bytes of a message, decompressed
@@ -253,6 +255,11 @@ class Bag:
         every = np.asarray(times)
         possible = every[(every >= 0) & (every < NEVER)].astype(np.int64)
         self._impossible += len(times) - len(possible)
+        back = int((possible[:-1] - possible[1:]).max(initial=0))
+        if SET_BACK_NS <= back < FAR_NS:
+            self.warnings.append(
+                f'{self.name}: the clock was set back by {back / 1e9:.1f} s while it was '
+                'recorded: messages from before and after that are judged as if they were from one time')
         self._times.append(possible)
 
     @property

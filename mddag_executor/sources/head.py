@@ -4,13 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 import re
 
 from mddag_executor.core.tables import DEMOTE
 from mddag_executor.recording.head import Head, is_declared, ReplayError
 from mddag_executor.recording.losses import Loss
+from mddag_executor.text import step_text
 from mddag_executor.trace import TraceError, TraceReader
 from mddag_executor.trace.errors import renamed
 from msg_graph import GraphError, loads, TaskSet
@@ -64,6 +65,14 @@ def without_declaration(name: str) -> ReplayError:
 def damage(warnings: Iterable[str], path: str, name: str) -> list[Loss]:
     """Return the warnings of a reader about damage of a file, with the given name."""
     return [Loss('damage', 1, renamed(text, path, name)) for text in warnings]
+
+
+def steps(name: str, several: Sequence[int]) -> list[Loss]:
+    """Return what a run lacks in which the system clock was set forward by so many ns."""
+    text = step_text(max(several, key=abs, default=0))
+    if len(several) > 1:
+        text = f'{text} (and {len(several) - 1} more)'
+    return [Loss('clock', len(several), f'{name}: {text}')] if several else []
 
 
 def no_end(name: str) -> Loss:

@@ -64,6 +64,7 @@ from mddag_executor.sources.head import (
     named_errors,
     no_end,
     no_jobs,
+    steps,
     TASK_SET,
 )
 from mddag_executor.text import counted
@@ -74,10 +75,11 @@ import numpy as np
 
 _PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
 (_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
- _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED) = (
+ _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP) = (
     f'mddag:{name}' for name in (
         'deadline', 'demote', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop',
-        'hosted', 'shutdown', 'judge_from', 'messages_lost', 'unfinished'))
+        'hosted', 'shutdown', 'judge_from', 'messages_lost', 'unfinished',
+        'clock_step'))
 _FIELDS = {
     DISPATCH: 'vtid callback dag vertex job worker ready',
     END: 'vtid callback',
@@ -85,7 +87,7 @@ _FIELDS = {
     _PUBLISH: 'vtid publisher_handle message_timestamp', _RELEASE: 'dag job release',
     _DEADLINE: 'dag vertex job deadline completed', _DEMOTE: 'dag vertex job',
     _FAIL: 'dag vertex job', _EXPIRE: 'dag job', _ABORT: 'dag job', _OUTDATE: 'dag job',
-    _LOST: 'count', _MESSAGES_LOST: 'callback count', _STOP: 'begin end',
+    _LOST: 'count', _CLOCK_STEP: 'step', _MESSAGES_LOST: 'callback count', _STOP: 'begin end',
     _JUDGE_FROM: 'release', _SHUTDOWN: 'end'}
 """The used fields of events that have only numbers."""
 _ROWS = {name: np.dtype([(field, 'i8') for field in ('place', 'timestamp', *fields.split())])
@@ -432,7 +434,8 @@ class _Source:
     def _doubts(self) -> list[Loss]:
         """Return defects of the trace."""
         name, path = self._name, self._reader.path
-        found = damage(self._reader.warnings, path, name)
+        found = [*damage(self._reader.warnings, path, name),
+                 *steps(name, self._pop(_CLOCK_STEP)['step'].tolist())]
         if self._strange:
             what, n = min(self._strange.items(), key=lambda item: (-item[1], item[0]))
             total = sum(self._strange.values())

@@ -41,7 +41,7 @@ from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, UNKNOWN
 from mddag_executor.sources.entities import INIT_EVENTS, signed
 from mddag_executor.sources.executions import number_pieces
-from mddag_executor.sources.head import no_end
+from mddag_executor.sources.head import no_end, steps
 from mddag_executor.sources.imported_events import (
     END,
     Events,
@@ -59,8 +59,8 @@ from mddag_executor.sources.stamps import find_stamps, Sent
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
-_DROP, _MESSAGES_LOST, _UNFINISHED = (
-    'mddag:drop', 'mddag:messages_lost', 'mddag:unfinished')
+_DROP, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP = (
+    'mddag:drop', 'mddag:messages_lost', 'mddag:unfinished', 'mddag:clock_step')
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
 # One in this many releases may exclude the origin of the grid, and one has to exclude others.
@@ -144,7 +144,7 @@ class UndeclaredRun(ImportedRun):
     """A run of this executor that was recorded without a declaration."""
 
     kinds = {**KINDS, **OWN_KINDS}
-    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED)
+    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP)
     links_type = _OwnLinks
     odd = {**OFF_THE_GRID, 'off': (
         'execution', 'of timers whose due times are not recorded and that kept to no period '
@@ -200,6 +200,9 @@ class UndeclaredRun(ImportedRun):
 
     def _missing(self, found: Recording) -> Iterator[Loss]:
         yield from super()._missing(found)
+        yield from steps(self.name, [
+            event[4] for event in self._events.others
+            if event[0].name == _CLOCK_STEP and isinstance(event[4], int)])
         if not found.run.shut_down:
             yield no_end(self.name)
 

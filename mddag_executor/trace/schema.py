@@ -169,6 +169,8 @@ _ALL = (
     _event('mddag', 'outdate', dag=_I32, job=_I64),
     # no thread of the process ran; a stop of length 0: from here on stops are recorded
     _event('mddag', 'stop', begin=_I64, end=_I64),
+    # the system clock was set forward by so much, which moves timers and stamps
+    _event('mddag', 'clock_step', step=_I64),
     _event('mddag', 'lost', count=_I64),
     _event('mddag', 'shutdown', end=_I64),
     # imported recordings: the name of the event's thread from here on

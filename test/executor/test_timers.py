@@ -6,15 +6,18 @@ import os
 import select
 import threading
 import time
+from types import SimpleNamespace
 
 from builtin_interfaces.msg import Time as TimeMessage
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor import open_recording
+from mddag_executor import clocks, open_recording
 from mddag_executor.core import NEVER
+from mddag_executor.executor import due
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.listeners import TimerFd
 from mddag_executor.executor.timers import TimerEntity
+from mddag_executor.report.live_runs import live_lines
 from msg_graph import loads
 import pytest
 from rclpy.clock import Clock
@@ -419,3 +422,39 @@ def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_n
         assert wait_for(lambda: got and node.get_clock().now().nanoseconds == 7_000 * MS)
         assert executor._registry.by_id[id(own)].name == '/node:on_clock'
         assert wait_for(lambda: executor.statistics()['callbacks']['/node:on_clock']['ran'] == 1)
+
+
+def test_a_step_of_the_system_clock_is_noticed(make_executor, make_node, tmp_path, monkeypatch):
+    """It is one line in the log, below the table of a run, and of a replay; slewing is none."""
+    path = tmp_path / 'run.mcap'
+    ahead, ran, logged = [0], [], []
+
+    class Time:
+        monotonic_ns = staticmethod(time.monotonic_ns)
+
+        @staticmethod
+        def time_ns():
+            return time.time_ns() + ahead[0]
+
+    monkeypatch.setattr(clocks, 'time', Time)
+    monkeypatch.setattr(due, 'get_logger', lambda _: SimpleNamespace(warning=logged.append))
+    node = make_node()
+    node.create_timer(0.01, lambda: ran.append(None), clock=Clock(
+        clock_type=ClockType.STEADY_TIME))
+    declared = loads(graph(node='name: tick, timer: 10ms, deadline: 9s'))
+    executor = make_executor(declared, trace=str(path), nodes=[node])
+    with Spinning(executor):
+        for more in (1_000_000, 3_600_000_000_000, -2_000_000_000):
+            n = len(ran)
+            assert wait_for(lambda n=n: len(ran) > n + 30)
+            ahead[0] += more
+        assert wait_for(lambda: len(executor.statistics()['clock_steps']) == 2)
+    found = executor.statistics()['clock_steps']
+    assert [round(each['step_ns'] / 1e9) for each in found] == [3600, -2]
+    lines = [line for line in live_lines({**executor.statistics(), 'measured': None})
+             if 'system clock' in line]
+    assert [line[:35] for line in lines] == [
+        'the system clock was set forward by', 'the system clock was set back by 2.']
+    assert [line for line in logged if 'clock' in line] == lines
+    said, = [loss for loss in open_recording(path).missing if loss.kind == 'clock']
+    assert (said.count, said.text) == (2, f'{path}: {lines[0]} (and 1 more)')

@@ -326,6 +326,20 @@ def test_a_pause_has_no_jobs_of_timers(tmp_path):
 
 
 @pytest.mark.parametrize('storage', [MCAP, SQLITE])
+def test_a_clock_that_was_set_back_is_said(tmp_path, storage):
+    def warnings(*seconds):
+        path = tmp_path / str(len(seconds))
+        write(path, {'/points': HEADER}, [
+            ('/points', BEGIN + round(at * 1000) * MS, header(BEGIN)) for at in seconds], storage)
+        return [text for text in Bag(path, ['/points']).warnings if 'set back' in text]
+
+    assert warnings(0, 1, 0.5, 2) == []
+    assert warnings(0, 100, 97.5, 98, 99) == [
+        f'{tmp_path / "5"}: the clock was set back by 2.5 s while it was recorded: messages '
+        'from before and after that are judged as if they were from one time']
+
+
+@pytest.mark.parametrize('storage', [MCAP, SQLITE])
 def test_messages_that_are_years_from_the_others_are_left_out(tmp_path, storage):
     """Until the first /clock, a recorder with --use-sim-time stamps messages with 0."""
     sound = rescheduled(tmp_path / 'sound', ARRIVALS[2:], storage)
