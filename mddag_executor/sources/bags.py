@@ -259,7 +259,8 @@ class Bag:
         if SET_BACK_NS <= back < FAR_NS:
             self.warnings.append(
                 f'{self.name}: the clock was set back by {back / 1e9:.1f} s while it was '
-                'recorded: messages from before and after that are judged as if they were from one time')
+                'recorded: messages from before and after that are judged as if they were from '
+                'one time')
         self._times.append(possible)
 
     @property
