@@ -26,7 +26,7 @@ def listed(names: Collection[str], most: int = 5) -> str:
 
 
 def step_text(step: int) -> str:
-    """Return a line about a step of the system clock, by so many ns forward."""
+    """Return a line about a step of the system clock; ``step``: ns forward."""
     return (f'the system clock was set {"forward" if step > 0 else "back"} by '
             f'{abs(step) / 1e9:.3f} s during the run: timers and stamps go by it, so results '
             'around that time are not those of the program: set the clock before the run')

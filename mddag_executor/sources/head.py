@@ -68,7 +68,7 @@ def damage(warnings: Iterable[str], path: str, name: str) -> list[Loss]:
 
 
 def steps(name: str, several: Sequence[int]) -> list[Loss]:
-    """Return what a run lacks in which the system clock was set forward by so many ns."""
+    """Return what a run lacks if the system clock was set, by steps in ns (forward)."""
     text = step_text(max(several, key=abs, default=0))
     if len(several) > 1:
         text = f'{text} (and {len(several) - 1} more)'
