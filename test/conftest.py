@@ -40,6 +40,7 @@ HERE = Path(__file__).resolve().parent
 
 CI = bool(os.environ.get('CI'))
 NEEDS = 'needs '
+BYTECODE = 'bytecode'
 
 # Reasons for which continuous integration may skip a test, and why it may.
 ALLOWED_SKIPS = {
@@ -79,6 +80,7 @@ def pytest_configure(config):
     os.environ.setdefault('MDDAG_DEBUG', str(HERE / 'invariants.py'))
     tempfile.tempdir = _session.enter_context(
         tempfile.TemporaryDirectory(prefix='mddag-test-', ignore_cleanup_errors=True))
+    keep_bytecode(os.environ, Path(tempfile.tempdir, BYTECODE))
     os.environ.pop('ROS_STATIC_PEERS', None)
     os.environ.update(
         ROS_DOMAIN_ID=str(_claim_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST',
@@ -107,6 +109,17 @@ def pytest_unconfigure(config):
                           for tool, count in counts.items())
         packages = ' '.join(missing_tools()[tool] for tool in counts)
         reporter.write_line(f'not tested: {tools}: sudo apt install {packages}')
+
+
+def keep_bytecode(environment, folder):
+    """
+    Let the programs that tests start share bytecode even if the user wants none to be written.
+
+    There are hundreds of them, and each would compile the same modules.  The bytecode is kept in a
+    folder of the session then, not next to the sources.
+    """
+    if environment.pop('PYTHONDONTWRITEBYTECODE', None):
+        environment.setdefault('PYTHONPYCACHEPREFIX', str(folder))
 
 
 def _claim_domain():
@@ -203,7 +216,7 @@ def nothing_left_behind():
         time.sleep(0.05)
     folder = Path(tempfile.gettempdir())
     files = [str(path) for path in folder.rglob('*')
-             if (top := path.relative_to(folder).parts[0]) != 'log'
+             if (top := path.relative_to(folder).parts[0]) not in ('log', BYTECODE)
              and not top.startswith('.org.chromium.')]
     assert (processes, files) == ({}, []), 'the tests left these processes and files behind'
 

@@ -14,7 +14,7 @@ from mddag_executor import __version__
 import pytest
 import yaml
 
-from .conftest import ALLOWED_SKIPS, is_allowed_skip
+from .conftest import ALLOWED_SKIPS, is_allowed_skip, keep_bytecode
 
 TOP = Path(__file__).resolve().parent.parent
 # Used as make: the first call fails with these tests in the cache, and the second one passes.
@@ -58,6 +58,23 @@ def test_a_skip_without_a_known_reason_fails_in_continuous_integration(monkeypat
     assert not is_allowed_skip('Skipped: something is not there')
     monkeypatch.setenv('MDDAG_NO_SKIP', 'ros2 is not installed')
     assert not is_allowed_skip('Skipped: ros2 is not installed here')
+
+
+def test_each_allowed_reason_is_one_of_a_test():
+    tests = ''.join(path.read_text(encoding='utf-8') for path in (TOP / 'test').rglob('*.py')
+                    if path.name != 'conftest.py')
+    assert [reason for reason in ALLOWED_SKIPS if reason not in tests] == []
+
+
+@pytest.mark.parametrize('unwanted', ['', '1'])
+def test_programs_share_bytecode_that_is_not_next_to_the_sources(tmp_path, unwanted):
+    (tmp_path / 'module.py').touch()
+    environment = {'PYTHONDONTWRITEBYTECODE': unwanted}
+    keep_bytecode(environment, tmp_path / 'kept')
+    subprocess.run([sys.executable, '-c', 'import module'], cwd=tmp_path, env=environment,
+                   check=True)
+    found, = tmp_path.rglob('module.*.pyc')
+    assert found.is_relative_to(tmp_path / ('kept' if unwanted else '__pycache__'))
 
 
 def test_tools_that_are_missing_are_known_with_their_packages():

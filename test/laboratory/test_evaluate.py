@@ -196,12 +196,10 @@ def test_interrupted_by_a_signal_to_all_processes(small):
     assert sum(outcome.result()['counts']) == outcome.runs
 
 
-distributed = pytest.importorskip('distributed', reason='the extra dask is not installed')
-
-
 @pytest.fixture(scope='module')
 def cluster(tmp_path_factory):
     """Give a cluster of two worker processes."""
+    distributed = pytest.importorskip('distributed', reason='the extra dask is not installed')
     import dask
     folder = str(tmp_path_factory.mktemp('dask'))
     with dask.config.set({'temporary-directory': folder}), distributed.LocalCluster(
@@ -211,6 +209,7 @@ def cluster(tmp_path_factory):
 
 
 def test_an_address_without_a_scheduler(autoware):
+    pytest.importorskip('distributed', reason='the extra dask is not installed')
     with pytest.raises(UsageError, match='^--dask tcp://127.0.0.1:1: .*: check the address, and '):
         evaluate(Experiment(autoware), 2, dask='tcp://127.0.0.1:1')
 
