@@ -133,7 +133,7 @@ inside the turnstile.
 """
 
 # Attributes that are safe in any thread, or not meant for callbacks.
-_UNGUARDED = {
+_WITHOUT_TURN = {
     'call_soon_threadsafe', 'run_forever', 'run_until_complete', 'stop', 'is_running',
     'is_closed', 'close', 'shutdown_asyncgens', 'shutdown_default_executor', 'get_debug',
     'set_debug', 'set_task_factory', 'get_task_factory', 'set_default_executor',
@@ -240,7 +240,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
         if wakes:
             self._write_to_self()  # type: ignore[attr-defined]
 
-    def guarded(self, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    def call_in_turn(self, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """
         Call a method in a thread that does not own the turnstile.
 
@@ -314,22 +314,22 @@ class CallbackLoop(asyncio.SelectorEventLoop):
         self.close()
 
 
-def _guard(name: str) -> None:
+def _take_turn_in(name: str) -> None:
     method = getattr(CallbackLoop, name)
 
     @wraps(method)
-    def guarded(self: CallbackLoop, *args: Any, **kwargs: Any) -> Any:
+    def in_turn(self: CallbackLoop, *args: Any, **kwargs: Any) -> Any:
         if self.is_owner():
             return method(self, *args, **kwargs)
-        return self.guarded(method, *args, **kwargs)
+        return self.call_in_turn(method, *args, **kwargs)
 
-    setattr(CallbackLoop, name, guarded)
+    setattr(CallbackLoop, name, in_turn)
 
 
 for _name in vars(asyncio.AbstractEventLoop):
-    if not _name.startswith('_') and _name not in _UNGUARDED and hasattr(
+    if not _name.startswith('_') and _name not in _WITHOUT_TURN and hasattr(
             asyncio.SelectorEventLoop, _name):
-        _guard(_name)
+        _take_turn_in(_name)
 
 
 # --- rclpy's futures in asyncio's tasks ----------------------------------------------------------

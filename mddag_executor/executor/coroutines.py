@@ -229,7 +229,7 @@ class Steps:
         """Cancel the coroutine, which is suspended, and let it run its last step."""
         waits_for, loop = self.waits_for, self.loop
         if isinstance(loop, CallbackLoop):
-            loop.guarded(lambda _: self.cancel())
+            loop.call_in_turn(lambda _: self.cancel())
             end = time.monotonic() + CLOSE_S
             while not waits_for.done() and time.monotonic() < end:  # a task ends some time later
                 time.sleep(0.001)

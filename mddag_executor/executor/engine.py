@@ -263,6 +263,9 @@ class Engine:
         """Handle undeclared work: a message, request, guard condition, waitable or task."""
         entity = work.entity
         if entity.removed or self._finished:
+            if not self._finished:  # a waitable's data are taken without the engine's lock
+                entity.ready += 1
+                self.verdicts.dropped(entity, NO_ORIGIN, 'destroyed', now)
             return
         self.undeclared += not entity.may_answer
         work.ready_ns = now

@@ -522,7 +522,7 @@ class MultiDeadlineExecutor(BareExecutor):
             if rest == 0.0:
                 self._upkeep.refresh()
                 rest = None
-            left = self._patience_s(deadline, rest)
+            left = self._rest_s(deadline, rest)
             if left is not None and left <= 0 and rest is None:
                 return
             wait_readable(self._at_once.loop.fd, left)
@@ -535,7 +535,7 @@ class MultiDeadlineExecutor(BareExecutor):
             if each is not None:
                 each.start()
 
-    def _patience_s(self, deadline: float | None, rest: float | None) -> float | None:
+    def _rest_s(self, deadline: float | None, rest: float | None) -> float | None:
         """Return for how long the spinning thread waits at most; None: until a wake-up."""
         now = time.monotonic()
         times = [rest, self._unclaimed.rest_s(), self._registry.bindings.rest_s()]
@@ -689,7 +689,7 @@ class MultiDeadlineExecutor(BareExecutor):
             return True
         if done():  # the event that woke it has just been handled
             return False
-        wait_readable(self._spin_once_epoll().fileno(), self._patience_s(
+        wait_readable(self._spin_once_epoll().fileno(), self._rest_s(
             deadline, self._upkeep.rest_s()))
         return self._handle_once()
 
@@ -749,7 +749,7 @@ class MultiDeadlineExecutor(BareExecutor):
         from mddag_executor.executor.asyncio_loop import set_done  # with asyncio
         fd, event = self._spin_once_epoll().fileno(), loop.create_future()
         loop.add_reader(fd, set_done, event)
-        left = self._patience_s(None, self._upkeep.rest_s())
+        left = self._rest_s(None, self._upkeep.rest_s())
         timer = None if left is None else loop.call_later(left, set_done, event)
         try:
             await event

@@ -545,6 +545,20 @@ def test_the_successor_of_a_callback_that_waits_starts_within_a_millisecond():
     assert patience + patience // CHECK_PART < MS
 
 
+def test_what_is_taken_while_its_node_is_removed_counts_as_dropped():
+    """A waitable's data are taken without the engine's lock."""
+    engine, recorded = new_engine(), []
+    engine.verdicts.record = lambda *event: recorded.append((event[0], event[-1]))
+    entity = new_entity()
+    engine.remove(entity, 0)
+    engine.ready(Work(entity, print), 1)
+    assert (entity.ready, entity.dropped, entity.is_through()) == (1, 1, True)
+    assert recorded == [('drop', 'destroyed')] and not engine.has_waiting
+    engine.finish(2)
+    engine.ready(Work(entity, print), 3)  # its recording is closed
+    assert entity.dropped == len(recorded) == 1
+
+
 def test_the_threads_that_check_do_not_count_as_computing():
     """
     They compute for as long as the shortest interval between two checks.
