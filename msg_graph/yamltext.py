@@ -26,6 +26,7 @@ from msg_graph.errors import GraphError, quoted
 import yaml
 
 MAX_BYTES = 16 * 1024 * 1024
+_MCAP = b'\x89MCAP'
 MAX_DEPTH = 32
 MAX_SIZE = 2_000_000
 
@@ -83,6 +84,10 @@ def decode(data: bytes, file: str) -> str:
         raise GraphError(
             file, None, f'the file is larger than {MAX_BYTES // 1024 ** 2} MiB',
             'is this the declaration? Split it into several graphs')
+    if data.startswith(_MCAP):
+        raise GraphError(
+            file, None, 'this is a recording, and a declaration is needed here',
+            'give a YAML file; for several traces of one run, give the folder that has them')
     try:
         return data.decode('utf-8')
     except UnicodeDecodeError as error:

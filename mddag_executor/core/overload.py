@@ -8,7 +8,7 @@ latest start with which all its sinks are in time, or the past if the vertex giv
 important ones.  So work that is in time costs one comparison.  Like ``rules`` this module contains
 only integer arithmetic, list indexing and ``heapq``.
 
-docs/run.md names the sources.
+docs/overload.md names the sources.
 """
 
 from __future__ import annotations
