@@ -51,7 +51,7 @@ def _of_user(name: str) -> Policy:
     except Exception as error:  # whatever the module raises
         said = ' '.join(f'{type(error).__name__}: {error}'.split())
         raise PolicyError(f"policy '{name}': it cannot be imported ({said}): write "
-                          'MODULE:FUNCTION, with its folder on PYTHONPATH') from error
+                          'MODULE:FUNCTION of a module in this folder or on PYTHONPATH') from error
     row = found if isinstance(found, Policy) else Policy(name, found, False, 'policy of a user')
     if not callable(row.key):
         raise PolicyError(f"policy '{name}': it cannot be called: give a function of (tables, "
