@@ -359,7 +359,8 @@ awaiting.named(
         'test_other_processes.py',
         'test_without_a_stamp_a_message_of_another_executor_has_no_job')),
     Case('calls_keep_their_worker', [(
-        'executor/publishing.py', 'with running.lend():', 'if True:')], of(
+        'executor/publishing.py', "with running.lend(f'service {service_name(self)}'):",
+        'if True:')], of(
         'test_bounds.py', 'test_blocked_calls_take_a_bounded_number_of_threads')),
     Case('triggers_are_not_announced', [(
         'executor/publishing.py', 'announce_trigger(self.pointer)', 'pass')], of(
