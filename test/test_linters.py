@@ -32,13 +32,12 @@ HEADER = re.compile(r'# Copyright 20\d\d The mddag_executor developers\n'
 # None in setup.py: the extra `ros` does. None in package.xml: another key does, or it is an extra.
 THIRD_PARTY = {
     **{name: (name, None) for name in (
-        'ament_index_python', 'action_msgs', 'builtin_interfaces', 'diagnostic_msgs',
-        'launch', 'launch_ros', 'rcl_interfaces', 'rclpy', 'ros2cli', 'rosgraph_msgs',
-        'rosidl_parser', 'std_msgs')},
+        'ament_index_python', 'action_msgs', 'diagnostic_msgs', 'launch', 'launch_ros',
+        'rcl_interfaces', 'rclpy', 'ros2cli', 'rosgraph_msgs', 'rosidl_parser', 'std_msgs')},
     **{name: (None, name) for name in (
         'distributed', 'llvmlite', 'matplotlib', 'pandas', 'pyarrow')},
     **{name: ('mcap-ros2-support', name) for name in ('lz4', 'mcap', 'zstandard')},
-    'argcomplete': ('python3-argcomplete', 'argcomplete'), 'dask': (None, 'distributed'),
+    'argcomplete': ('python3-argcomplete', 'argcomplete'),
     'numpy': ('python3-numpy', 'numpy'),
     'rosbags': ('python3-rosbags-pip', 'rosbags'), 'yaml': ('python3-yaml', 'PyYAML'),
 }
@@ -160,7 +159,10 @@ def test_what_is_imported_is_declared():
     assert {'numpy', 'yaml'} & foreign
     unknown = {name: imported[name] for name in foreign - set(THIRD_PARTY)}
     assert unknown == {}, 'add them to package.xml, setup.py and THIRD_PARTY'
+    assert set(THIRD_PARTY) - foreign == set(), 'remove them there: nothing imports them'
     keys = {element.text for element in package_xml().iter('exec_depend')}
+    # what starts run.launch.py is imported by nothing
+    assert keys - {THIRD_PARTY[name][0] for name in foreign} == {'ros2launch'}
     text = (TOP / 'setup.py').read_text(encoding='utf-8')
     required = text[text.index('install_requires'):text.index('extras_require')]
     for name in foreign:

@@ -33,6 +33,8 @@ HUNG_S = 50
 """After this many seconds a test of a child hangs."""
 RUN_S = 170
 """A run that takes longer is ended."""
+RUN_OF_ALL_S = 450
+"""The same for all tests together."""
 IN_PARALLEL = 3
 """This many runs at a time: their tests mostly wait."""
 AT_ONCE_S = 4.0
@@ -382,7 +384,7 @@ class Result:
         return {test for test, (message, _) in self.tests.items() if 'Timeout' in message}
 
 
-def run(folder, name, changes, tests, *options):
+def run(folder, name, changes, tests, *options, seconds=RUN_S):
     """Run tests with a changed executor, in a process of their own."""
     report = folder / f'{name}.xml'
     environment = {
@@ -398,9 +400,9 @@ def run(folder, name, changes, tests, *options):
         start_new_session=True)
     output = ''
     try:
-        output, _ = child.communicate(timeout=RUN_S)
+        output, _ = child.communicate(timeout=seconds)
     except subprocess.TimeoutExpired:
-        return Result(dict.fromkeys(tests, ('Timeout', RUN_S)), '')
+        return Result(dict.fromkeys(tests, ('Timeout', seconds)), '')
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)  # and what it may have left
@@ -439,7 +441,7 @@ def test_each_mutation_changes_the_present_executor():
 @pytest.mark.timeout(500)
 def test_all_of_them_pass_while_nothing_is_broken(tmp_path):
     tests = list(dict.fromkeys(test for case in CASES for test in case.tests))
-    result = run(tmp_path, 'unbroken', [], tests)
+    result = run(tmp_path, 'unbroken', [], tests, seconds=RUN_OF_ALL_S)
     assert set(result.tests) == set(tests) and not result.failed() | result.hung(), result.output
 
 
