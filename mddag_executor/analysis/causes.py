@@ -83,8 +83,8 @@ REMEDIES = {
     'destroyed': 'keep the node and its subscription until the job has ended',
     'not published': 'publish in each execution of the callback before it, or declare the topic '
                      'under `may_publish`',
-    'lost': 'reliable QoS or a longer queue (QoS depth); if a process ended early (see the '
-            'warnings), its end',
+    'lost': 'reliable QoS, the same QoS of publisher and subscription, or a longer queue (QoS '
+            'depth); if a process ended early (see the warnings), its end',
     'failed': 'mend what the callback raises',
     'other topic': 'let the other topics of the sync come earlier: less work before them, or '
                    'deadlines for the callbacks that publish them',

@@ -356,8 +356,10 @@ def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
         'dropped': {name: c['dropped'] for name, c in callbacks.items() if c['dropped']},
         'unattributed': {key: sum(part['unattributed'][key] for part in parts)
                          for key in ('unknown', 'doubtful')},
+        # of a process that has died nothing is known
         'never_ran': [c.key for c in task_set.callbacks
-                      if not callbacks.get(c.key, {'ran': 0})['ran']],
+                      if str(task_set.process_of(c.node)) in results
+                      and not callbacks.get(c.key, {'ran': 0})['ran']],
         'not_found': {key: question for part in parts
                       for key, question in part['not_found'].items()},
         'measured': None,
@@ -388,4 +390,5 @@ def _observed(task_set: TaskSet, results: Results) -> Observed:
         end_ns=max((part['end_ns'] for part in parts.values()), default=0),
         releases=releases, messages=messages, executions=executions,
         topics_received=received, publishes={**publishes},
+        nodes={c.node for c in task_set.callbacks if str(task_set.process_of(c.node)) in parts},
         undeclared=[Entity(*each) for part in parts.values() for each in part['undeclared']])

@@ -42,7 +42,10 @@ def disagreement(as_recorded: Reschedule) -> str | None:
     text = (f'{recorded.recording.run.name}: with the recorded pool the prediction has '
             f'{_percent(predicted):.1f} % of the results in time, but {_percent(found):.1f} % '
             'were: predictions for other pools are off by as much, or more')
-    share = _computing(recorded)
+    share, run = _computing(recorded), recorded.recording.run
+    if not (run.declared or run.imported):
+        return (f'{text}: the recorded run had no declaration, so its callbacks did not run in '
+                'the order of their deadlines: record it with the declaration')
     if difference > 0 and share is not None:
         text += (": they do not include other load of the machine and waits for Python's lock "
                  f'(callbacks that compute ran on a CPU for {share:.0f} % of their time)')

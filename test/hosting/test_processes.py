@@ -198,6 +198,9 @@ def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
         result, out, errors = end(run)
     assert run.returncode == 70
     assert 'process up was ended by signal 9 (Killed)' in errors
+    # what ran in it is not known
+    assert not [each for each in result['drift'] if each['kind'] == 'never ran']
+    assert not result['never_ran']
     up, down = result['processes']
     assert (up['died'], up['how'], down['died']) == (True, 'was ended by signal 9 (Killed)', False)
     assert result['dags']['chain']['sinks']['/last:sink']['completed'] > 0

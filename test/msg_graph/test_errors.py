@@ -119,6 +119,13 @@ VALUES = {
     'deadline': ('none', 'None', 'never', 'no', '0', '-1ms', '[none]', 'none, tolerate: 1 of 9',
                  'none, importance: high', 'none, keep: newest', ''),
     'driven_by': ('/a', '[/a]')}
+PATH_VALUES = {
+    'callbacks': ("['/n:t']", "['/n:t', '/n:v']", "['/n:t', '/n:x']", "['/n:u', '/n:t']",
+                  "['/n:t', '/n:t']", '/n:t', "['t', 'u']", '[]', ''),
+    'reaction': ('9', '-1ms', '0', 'none', '[9s]', '9 hours', ''),
+    'age': ('9ms', '9', '0ms', 'fast', '{max: 9ms}', ''),
+    'tolerate': ('1 of 100', '1', '2 of 1', '0 of 0', '1%', '-1 of 9', '[1, 9]', ''),
+    'deadline': ('9ms',), 'reation': ('9ms',)}
 
 
 def test_wrong_uses_of_the_keys_of_ordinary_robots():
@@ -135,4 +142,15 @@ def test_wrong_uses_of_the_keys_of_ordinary_robots():
                 assert len(errors) <= 1 + (value == '[/a]')     # a cycle, and no sink
                 line = errors[0].split('callback ', 1)[1] if errors else 'accepted'
                 found.append(f'{what}, {key}: {value} -> {line}')
+    for key, values in PATH_VALUES.items():
+        for value in values:
+            entry = {'name': 'p', 'callbacks': "['/n:t', '/n:u']", 'reaction': '9s'} | {key: value}
+            text = (HEAD + '  - {name: t, timer: 9ms, publishes: [/a]}\n'
+                    '  - {name: u, subscription: /a, deadline: 9ms}\n'
+                    '  - {name: v, timer: 9ms, deadline: 9ms, dag: v}\n'
+                    f'paths: [{{{", ".join(f"{k}: {v}" for k, v in entry.items())}}}]\n')
+            errors = errors_of(loads, text, 'g.yaml')
+            assert len(errors) <= 1
+            line = errors[0].removeprefix('> g.yaml:') if errors else 'accepted'
+            found.append(f'path, {key}: {value} -> {line}')
     golden.compare('wrong_uses', '\n'.join(found) + '\n', GOLDEN)

@@ -464,20 +464,25 @@ def verdicts(in_time, late):
     return SimpleNamespace(result=lambda: {'dags': dags})
 
 
-@pytest.mark.parametrize(('predicted', 'recorded', 'text'), [
-    ((96, 4), (92, 8), None),
-    ((9, 0), (0, 9), None),     # too few
+@pytest.mark.parametrize(('predicted', 'recorded', 'text', 'declared'), [
+    ((96, 4), (92, 8), None, True),
+    ((9, 0), (0, 9), None, True),     # too few
     ((80, 20), (40, 60), '80.0 % of the results in time, but 40.0 % were: predictions for other '
      'pools are off by as much, or more: they do not include other load of the machine and waits '
-     "for Python's lock (callbacks that compute ran on a CPU for 25 % of their time)"),
+     "for Python's lock (callbacks that compute ran on a CPU for 25 % of their time)", True),
     ((40, 60), (80, 20), '40.0 % of the results in time, but 80.0 % were: predictions for other '
-     'pools are off by as much, or more')])
-def test_a_prediction_is_compared_with_what_the_recorded_pool_did(predicted, recorded, text):
+     'pools are off by as much, or more', True),
+    ((80, 20), (40, 60), '80.0 % of the results in time, but 40.0 % were: predictions for other '
+     'pools are off by as much, or more: the recorded run had no declaration, so its callbacks '
+     'did not run in the order of their deadlines: record it with the declaration', False)])
+def test_a_prediction_is_compared_with_what_the_recorded_pool_did(
+        predicted, recorded, text, declared):
     executions = rows(EXECUTIONS, 3, holds_gil=(True, True, False), cpu=(10, 15, 1),
                       busy=(50, 50, 900))
     found = disagreement(SimpleNamespace(tally=verdicts(*predicted), recorded=SimpleNamespace(
         tally=verdicts(*recorded), recording=SimpleNamespace(
-            run=SimpleNamespace(name='run.mcap'), executions=executions))))
+            run=SimpleNamespace(name='run.mcap', declared=declared, imported=False),
+            executions=executions))))
     assert found == (None if text is None else
                      f'run.mcap: with the recorded pool the prediction has {text}')
 
