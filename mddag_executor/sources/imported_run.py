@@ -420,6 +420,10 @@ class ImportedRun:
             yield Loss('events', self.links.discarded, (
                 f'{name}: the tracer discarded {counted(self.links.discarded, "event")} or more: '
                 'executions and messages may be missing'))
+        for each in self.links.callbacks:   # the messages of a source come from outside
+            vertex = self._vertex.get(each.number)
+            if vertex is not None and not self.task_set.vertices[vertex].predecessors:
+                self.links.losses.forget('messages', each.label)
         for text in self._clocks.lines():
             yield Loss('clock', 1, f'{name}: {text}')
         yield from self.links.losses.found(name, 'events')

@@ -112,6 +112,10 @@ class Oddities:
         if number:
             self._counts[kind][affected] += number
 
+    def forget(self, kind: str, affected: str) -> None:
+        """Do not report events of a kind that affected a callback or topic."""
+        self._counts[kind].pop(affected, None)
+
     def found(self, name: str, kind: Kind) -> Iterator[Loss]:
         """Yield what was counted in a recording."""
         for counts, (noun, text) in zip(self._counts.values(), self._said.values()):

@@ -192,6 +192,21 @@ def test_messages_of_others_are_of_no_job(run):
     assert (of_camera(again)['completed'], of_camera(again)['late']) == (4, 0)
 
 
+def test_messages_of_a_source_may_be_of_anyone(run):
+    # a latched map, for instance, which its node published when it was made
+    run.graph.write_text(GRAPH.split('  - {node: /detect')[0].replace(
+        'publishes: [/image]', 'deadline: 90ms') + """\
+  - node: /detect
+    callbacks: [{name: run, subscription: /image, period: 1s, sporadic: true, deadline: 40ms}]
+""")
+    for job in range(3):
+        run.runs(GRAB, 100 * job, 100 * job + 1)
+    run.detects(50)
+    result = run.result(300)
+    assert result['dags']['/detect']['sinks']['/detect:run']['completed'] == 1
+    assert result['warnings'] == []
+
+
 @pytest.mark.parametrize('in_order', [True, False])
 def test_who_published_is_never_guessed(in_order, run):
     # both publish on one topic while both run; messages are taken later
