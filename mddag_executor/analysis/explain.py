@@ -541,4 +541,5 @@ def medians(numbers: Any, times: Ints, count: int) -> Ints:
     np.add.at(counts, (numbers, steps), 1)
     below = np.cumsum(counts, axis=1)
     middle = (2 * below >= below[:, -1:]).argmax(axis=1)
-    return np.where(below[:, -1] > 0, np.exp2((middle + 0.5) / _STEPS), 0).astype(np.int64)
+    found = np.exp2(np.minimum((middle + 0.5) / _STEPS, 62))    # 64 bits
+    return np.where(below[:, -1] > 0, found, 0).astype(np.int64)

@@ -166,7 +166,10 @@ def ratio_table(outcome: Evaluation) -> tuple[list[str], list[list[Cell]]]:
     for i, (centre, count) in enumerate(zip(outcome.bins, acceptance[-1].runs)):
         if count == 0 and len(outcome.experiments) > 1:
             continue  # most of the many bins may be empty
-        rows.append([f'{centre:.2f}', count, *(_percent(each.ratio[i]) for each in acceptance)])
+        # the first and the last bin have everything beyond them
+        end = {0: ' or less', len(outcome.bins) - 1: ' or more'}.get(i, '')
+        rows.append([f'{centre:.2f}{end}', count,
+                     *(_percent(each.ratio[i]) for each in acceptance)])
     rows.append(['all', outcome.runs, *(_percent(each.total) for each in acceptance)])
     return ['utilisation', 'runs', *outcome.experiment.policies, 'bound'], rows
 

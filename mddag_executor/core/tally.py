@@ -199,7 +199,8 @@ class SinkTally:
         """Return the sink's part of the result."""
         response: ResponseTimes | None = None
         if self.responses:
-            ordered = sorted(self.responses)
+            ordered = self.responses if isinstance(self.responses, memoryview) else sorted(
+                self.responses)
             response = {
                 'min': self.shortest, 'median': quantile(ordered, 0.5),
                 'p99': quantile(ordered, 0.99), 'max': self.longest}

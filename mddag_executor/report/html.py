@@ -199,9 +199,11 @@ def _head(data: ReportData) -> Iterator[str]:
         f'<span><b>{escape(printable(word))}</b> {escape(printable(text))}</span>'
         for word, text in data.facts) + '</p>\n'
     if dags:
-        good = every.due and not every.missed and not not_met(
-            data.result.get('requirements', {}))
-        lines = [*worst_line(data)]
+        missed = not_met(data.result.get('requirements', {}))
+        good = every.due and not every.missed and not missed
+        lines = [f'{path}: the required {what} is not met: {why}'
+                 for (path, what), why in missed.items()]
+        lines += worst_line(data)
         if data.result.get('misses') is not None:
             lines += causes_line(data.result['misses'])
         yield (f'<div class="verdict {"good" if good else "bad"}"><b>{verdicts_line(dags)}</b>'

@@ -111,11 +111,12 @@ def page(result: Mapping[str, Any], title: str) -> Iterator[str]:
     for line in (*_missed_lines(result), *_load_lines(result), *_summary(result)):
         yield f'<p class="note">{escape(line)}</p>\n'
     short = _short(result)
-    yield (f'<h2>{_QUESTION}</h2>\n<p class="note">If the others '
-           f'take as long as now. The bars are logarithmic, up to {result["most"]:g} times.</p>\n')
-    yield '<div class="wide">' + html_table(('callback', 'then misses', 'may take'), [
-        (short[name], short[one['breaks']], _bar(one['factor'], result['most']))
-        for name, one in _tightest(result)], 2) + '</div>'
+    rows = [(short[name], short[one['breaks']], _bar(one['factor'], result['most']))
+            for name, one in _tightest(result)]
+    if rows:
+        yield (f'<h2>{_QUESTION}</h2>\n<p class="note">If the others take as long as now. The '
+               f'bars are logarithmic, up to {result["most"]:g} times.</p>\n<div class="wide">')
+        yield html_table(('callback', 'then misses', 'may take'), rows, 2) + '</div>'
     yield '<h2>Margins of the sinks</h2>\n'
     yield html_table(_MARGINS, [(short[name], *_margins(sink))
                                 for name, sink in _least_first(result['sinks'])], 1)

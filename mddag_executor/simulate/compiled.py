@@ -26,6 +26,7 @@ import os
 from pathlib import Path
 import platform
 from typing import Any
+import weakref
 
 from mddag_executor import progress
 from mddag_executor.core.state import Decision, State
@@ -43,6 +44,12 @@ import numpy.typing as npt
 _COMPILE_S = 4.0    # approximate compile time
 _REPEATS = 4        # assumed repetitions of such work, as with other settings
 _STORED = 8         # kept versions of the code
+
+_MANY = 100_000
+"""More elements are not copied."""
+_C = ctypes.CDLL(None)
+_C.malloc.restype, _C.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+_C.free.restype, _C.free.argtypes = None, [ctypes.c_void_p]
 
 PLAIN = 'MDDAG_PLAIN'
 """The environment variable that forbids compiling, if it is not empty."""
@@ -141,12 +148,19 @@ def run_each(
     core, workers, *_ = working = [
         Memory(*[0] * len(fields)) for fields in (
             State._fields, Pool._fields, Deliveries._fields, Machine._fields)]
+    decisions, busy, log = (
+        State._fields.index('decisions'), *map(Pool._fields.index, ('busy', 'log')))
+    if len(load.times) > _MANY:
+        jobs = np.bincount(load.dags, minlength=tables.n_dags + 1)
+        ends, sinks, vertices = 1, np.diff(tables.first_sink), np.diff(tables.first_vertex)
+        core.reserve(decisions, 6, int(jobs[:tables.n_dags] @ (ends + sinks[:tables.n_dags])))
+        if options.keep_log:
+            workers.reserve(log, 6, int(
+                jobs[:tables.n_dags] @ (1 + 2 * vertices[:tables.n_dags]) + 2 * jobs[-1]))
     addresses = [each.address for each in working]
     call = entry_points()
     ended = call['run_each'](*(each.address for each in lent), *addresses, missed.address)
     try:
-        decisions, busy, log = (
-            State._fields.index('decisions'), *map(Pool._fields.index, ('busy', 'log')))
         return ((int(ended), Rows(workers.words(log, 6)),  # type: ignore[return-value]
                  Rows(core.words(decisions, 6)), workers.words(busy, 1)[:, 0].tolist()),
                 missed.words(0, 1)[:, 0].tolist())
@@ -178,13 +192,31 @@ class Memory:
         """Return its address, valid as long as this object lives."""
         return int(self._words.ctypes.data)
 
+    def reserve(self, field: int, width: int, length: int) -> None:
+        """
+        Give an empty vector room for ``length`` elements of ``width`` words.
+
+        It takes no memory before it is used.  A vector that grows copies itself again and again.
+        """
+        address = _C.malloc(8 * width * max(1, length))
+        if address:
+            self._words[3 * field:3 * field + 3] = address, 0, length
+
     def words(self, field: int, width: int) -> npt.NDArray[np.int64]:
-        """Return a copy of a field, a vector whose elements have ``width`` words."""
+        """
+        Return a field, a vector whose elements have ``width`` words.
+
+        Large ones are not copied: their memory belongs to the array, and the field is empty then.
+        """
         address, length = self._words[3 * field:3 * field + 2].tolist()
         if length == 0:
             return np.empty((0, width), dtype=np.int64)
         data = (ctypes.c_int64 * (length * width)).from_address(address)
-        return np.array(data, dtype=np.int64).reshape(length, width)
+        if length <= _MANY or self._columns:    # small, or of numpy
+            return np.array(data, dtype=np.int64).reshape(length, width)
+        self._words[3 * field:3 * field + 3] = 0
+        weakref.finalize(data, _C.free, address).atexit = False
+        return np.frombuffer(data, dtype=np.int64).reshape(length, width)
 
 
 class Rows(Sequence[tuple[int, ...]]):

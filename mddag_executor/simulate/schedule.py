@@ -31,6 +31,8 @@ from mddag_executor.simulate.workload import as_list, as_lists, Workload
 PLAIN_S, _STOPS_S = 10e-6, 50e-6
 SOON_S = 1.0
 """For less time, loading compiled code does not pay."""
+_PART = 1 << 16
+"""The number of decisions that are counted together."""
 
 
 @dataclass(frozen=True)
@@ -124,15 +126,20 @@ class Scheduled(NamedTuple):
         tally.jobs = np.bincount(
             dags[judged].astype(np.int64), minlength=len(tally.jobs)).tolist()
         decisions = np.asarray(self.decisions, dtype=np.int64).reshape(-1, 6)
-        # column by column: most rows are chosen, so their copies are large
+        # column by column, or in parts: most rows are chosen, so their copies are large
         kind, dag, place, _, how, _ = decisions.T
         results = np.flatnonzero(kind < JOB_END)
-        tally.add_results(*(decisions[results, column] for column in (0, 2, 3, 4, 5)))
+        tally.add_results(
+            kind[results].astype(np.int8), place[results].astype(np.int32),
+            *(decisions[results, column] for column in (3, 4, 5)))
+        del results
         tally.add(decisions[kind == SINK_DEMOTED].tolist())
-        ends = np.flatnonzero((kind == JOB_END) & (place != NOT_JUDGED))
-        pairs, numbers = np.unique(dag[ends] << 8 | how[ends], return_counts=True)
-        for pair, number in zip(pairs.tolist(), numbers.tolist()):
-            tally.ends[pair >> 8][pair & 255] = number
+        for first in range(0, len(decisions), _PART):
+            kind, dag, place, _, how, _ = decisions[first:first + _PART].T
+            ends = (kind == JOB_END) & (place != NOT_JUDGED)
+            numbers = np.bincount(dag[ends] << 8 | how[ends])
+            for pair in np.flatnonzero(numbers).tolist():
+                tally.ends[pair >> 8][pair & 255] += int(numbers[pair])
 
 
 def schedule(

@@ -280,6 +280,10 @@ class ExecutionJoin:
         rest = dag >= 0
         if not rest.all():
             self._strange[f'{COMPLETE} of a vertex that is not declared'] += int((~rest).sum())
+        never = rest & (complete['completed'][event] < 0)
+        if never.any():
+            self._strange[f'{COMPLETE} at an impossible time'] += int(never.sum())
+            rest &= ~never
         table, good = self._executions.rows(), rest & (at >= 0)
         row = self._dispatches.row[at[good]]
         good[good] = fits = (table['end'][row] >= 0) & (table['vertex'][row] == vertex[good]) & (

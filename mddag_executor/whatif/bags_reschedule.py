@@ -15,11 +15,13 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 import os
 import random
 from typing import Any
 
 from mddag_executor.recording.columns import Ints
+from mddag_executor.recording.recording import Recording
 from mddag_executor.simulate.execution_times import check_execution_times
 from mddag_executor.sources.bag_run import read_bag
 from mddag_executor.whatif.reschedule import Reschedule, reschedule
@@ -41,13 +43,18 @@ def reschedule_bag(
     """
     if times is None:
         check_execution_times(task_set, ', or give --execution-times FILE')
-    run = read_bag(path, task_set, name)
-    counts = np.bincount(run.releases['dag'], minlength=len(task_set.dags)).tolist()
     generator = random.Random(seed)
-    return reschedule(run, times=[
-        _drawn(dag, count, generator) if times is None
-        else np.tile(np.array(times[dag.index], dtype=np.int64), (count, 1))
-        for dag, count in zip(task_set.dags, counts)], overheads=False, **options)
+
+    def times_of(run: Recording) -> list[Ints]:
+        counts = np.diff(run.jobs.first).tolist()
+        return [
+            _drawn(dag, count, generator) if times is None
+            else np.tile(np.array(times[dag.index], dtype=np.int64), (count, 1))
+            for dag, count in zip(task_set.dags, counts)]
+
+    # the recording is large, and only its load is kept
+    return reschedule(partial(read_bag, path, task_set, name), times=times_of, overheads=False,
+                      **options)
 
 
 def _drawn(dag: Dag, count: int, generator: random.Random) -> Ints:

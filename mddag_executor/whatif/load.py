@@ -100,6 +100,8 @@ Columns by job, by job and vertex, or by job and edge.  Times are in ns, or ``_U
 busy; ``dispatch``: the index of the dispatch time in ``_dispatch_ns``; ``held``: 1 if the
 execution held the interpreter, 0 if not; ``sent``: 1 if the message was published.
 """
+_ALWAYS = ('release', 'noticed', 'took', 'cpu', 'held')
+"""The columns that are not all unknown if the recording has no executions."""
 
 
 class LoadBuilder:
@@ -151,12 +153,20 @@ class LoadBuilder:
         self._base[_VERTEX] += np.array(tables.index_in_dag[:tables.n_vertices], dtype=np.int64)
         self._columns: dict[str, Any] = {
             name: np.full(self._begins[by, -1], _UNKNOWN, dtype=kind)
+            if len(recording.executions) or name in _ALWAYS
+            else np.broadcast_to(np.array(_UNKNOWN, dtype=kind), self._begins[by, -1])
             for name, (by, kind) in _COLUMNS.items()}
         for dag, mine in enumerate(of_dag):
             release, noticed = self._of(dag, 'release', 'noticed')
             release[:] = jobs.release[mine]
             noticed[:] = np.maximum(jobs.release[mine], jobs.noticed[mine])
         self._note_ends()
+        self._others, self._dispatch_ns = [np.empty((0, 3), dtype=np.int64)], np.empty(
+            0, dtype=np.int64)
+        #: By global vertex: the address of the callback that ran as it.
+        self.callback_of: dict[int, int] = {}
+        if not len(recording.executions):
+            return
         self._executions = table = recording.executions
         places = recording.job_places
         #: By execution the row of its job.
@@ -229,8 +239,7 @@ class LoadBuilder:
         ran_as = np.full(self._tables.n_vertices + 1, _UNKNOWN)
         ran_as[vertex[::-1]] = rows[::-1]     # the first one is written last
         callback = self._recording.executions['callback']
-        #: By global vertex: the address of the callback that ran as it.
-        self.callback_of: dict[int, int] = {
+        self.callback_of = {
             v: int(callback[at]) for v, at in enumerate(ran_as[:-1].tolist()) if at >= 0}
         mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
         self._columns['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
@@ -370,16 +379,21 @@ class LoadBuilder:
         :param workers: workers of each process, if fewer than in the recording.
         """
         process = process or self._process
+        ran = len(self._recording.executions) > 0
         every, usual, late = self._dispatches()
+        if not overheads:
+            late = late[:0].copy()
         self._subtract_others(workers == 1 or max(process) < max(self._process))
-        unsent = self._unsent()
-        delays, transport = self._transports(overheads, process)
-        if unsent:
-            delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
+        unsent, delays, transport = self._unsent(), None, None
+        if ran:
+            delays, transport = self._transports(overheads, process)
+            if unsent:
+                delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
         for name in ('start', 'end', 'arrived', 'sent'):    # they are large for long runs
             del self._columns[name]
         estimated, unknown = self._estimate(process, unsent)
-        took, cpu, held = (self._columns[name] for name in ('took', 'cpu', 'held'))
+        del unsent
+        took, cpu, held = (self._columns.pop(name) for name in ('took', 'cpu', 'held'))
         demand, executions = int(took.sum()), len(took)
         if overheads:
             took += late
@@ -387,20 +401,21 @@ class LoadBuilder:
         others = others[sort_by(*others.T)]
         more = np.zeros(len(others), dtype=np.int64)
         number = others[:, 2]
-        costs = np.concatenate([took, np.maximum(0, others[:, 1]) + np.where(
-            (number >= 0) & overheads, every[number], 0)])
+        costs = took if not len(others) else np.concatenate([
+            took, np.maximum(0, others[:, 1]) + np.where(
+                (number >= 0) & overheads, every[number], 0)])
         columns: dict[str, Any] = {
             'holds': np.concatenate([held, more]) if held.any() else []}
-        if len(self._recording.executions):
+        if ran:
             columns |= {
                 'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
                 'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
                 'delay_base': self._begins[_EDGE, :-1].tolist()}
+        del took, cpu, held
         load = self._load(costs, others[:, 0], overheads, workers == 1)
         return RecordedLoad(
             load._replace(fates=self._fates(len(costs)), **columns),
-            self._numbers, demand, executions, estimated, unknown,
-            usual, transport, late if overheads else late[:0])
+            self._numbers, demand, executions, estimated, unknown, usual, transport, late)
 
     def _unsent(self) -> list[Any]:
         """Return by DAG, job and edge whether the edge was not published, as far as known."""
@@ -501,23 +516,23 @@ class LoadBuilder:
             took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)
 
     def _load(self, costs: Any, others: Ints, overheads: bool, one_worker: bool) -> Workload:
-        n_dags = len(self._numbers)
-        counts = [len(others), *map(len, self._numbers)]
-        releases, times = [others], [others]
+        n_dags, times = len(self._numbers), list[Any]()
         for dag in range(n_dags):
             release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
-            releases.append(release)
             times.append(release if self._timer[dag] and not overheads else np.where(
                 (turn >= 0) | one_worker & (busy > 0), release, noticed))
-        ready = np.concatenate(times)
-        dags = np.repeat(np.array([n_dags, *range(n_dags)]), counts)
-        rows = np.concatenate([np.arange(count) for count in counts])
-        order = sort_by(ready, dags, rows)
-        columns: list[Any] = [
-            column[order] for column in (ready, dags, rows, np.concatenate(releases))]
-        ready, dags, rows, release = columns
-        return Workload(ready, dags, rows, costs, self._begins[_VERTEX].tolist(),
-                    [*self._widths[_VERTEX].tolist(), 1], release)
+        ready = np.concatenate([*times, others])
+        times.clear()
+        order = sort_by(ready)      # equal ones stay in the order of DAGs and jobs
+        counts = [*map(len, self._numbers), len(others)]
+        releases = [release for dag in range(n_dags) for release in self._of(dag, 'release')]
+        columns: list[Any] = [ready[order]]
+        del ready
+        columns.append(np.repeat(np.arange(n_dags + 1), counts)[order])
+        columns.append(np.concatenate([np.arange(count) for count in counts])[order])
+        columns += [costs, self._begins[_VERTEX].tolist(), [*self._widths[_VERTEX].tolist(), 1],
+                    np.concatenate([*releases, others])[order]]
+        return Workload(*columns)
 
     def _transports(self, overheads: bool, process: Sequence[int]) -> tuple[Any, int | None]:
         """

@@ -24,7 +24,7 @@ from mddag_executor.memory import give_back
 from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import Head, ReplayError
 from mddag_executor.recording.recording import Recording
-from mddag_executor.recording.tables import UNKNOWN
+from mddag_executor.recording.tables import Columns, UNKNOWN
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.execution_times import with_execution_times
 from mddag_executor.simulate.policies import ALL_POLICIES, preempts, ROS2
@@ -177,7 +177,7 @@ class Reschedule:
 
 
 def reschedule(
-    path: Given | Recording,
+    path: Given | Recording | Callable[[], Recording],
     task_set: TaskSet | None = None,
     *,
     policy: str | None = None,
@@ -191,12 +191,12 @@ def reschedule(
     skip: int = 0,
     cpus: int | None = None,
     processes: Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None = None,
-    times: Sequence[Any] | None = None,
+    times: Callable[[Recording], Sequence[Any]] | None = None,
 ) -> Reschedule:
     """
     Run the core with the releases and execution times of a trace.
 
-    :param path: a trace of this executor, or a recording.
+    :param path: a trace of this executor, a recording, or a function that reads one.
     :param task_set: the declaration to schedule by; None: the one in the trace.
     :param policy: a row of ``mddag_executor.simulate.ALL_POLICIES``; None: as recorded.
     :param workers: size of the pool of each process; None: as recorded.
@@ -211,8 +211,8 @@ def reschedule(
     :param cpus: shared by executions that compute; None: as recorded, enough for all if unknown.
     :param processes: returns the nodes of each process, from the task set and the time of each
         vertex; None: as recorded, or as in ``task_set``.
-    :param times: by DAG the execution times of its jobs and vertices, ns, for a recording without
-        executions.
+    :param times: returns by DAG the execution times of its jobs and vertices, ns, for a recording
+        without executions.
     :raises mddag_executor.trace.TraceError: if the file is not a trace.
     :raises mddag_executor.ReplayError: if the trace has nothing to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
@@ -222,7 +222,7 @@ def reschedule(
         preempts(policy, preemptive or False)
     if workers is not None and not 1 <= workers <= MOST_WORKERS:
         raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
-    run = path if isinstance(path, Recording) else open_recording(
+    run = path if isinstance(path, Recording) else path() if callable(path) else open_recording(
         path, task_set, name, progress)
     if run.task_set is EMPTY_TASK_SET:
         raise undeclared(run.name, run.run.imported)
@@ -240,7 +240,8 @@ def reschedule(
     tables = tables_of(run.task_set)
     recorded = Replay(run, skip) if run.run.messages is None else None
     with gc_paused():
-        builder = LoadBuilder(run, tables, each, _processes(run, run.run.placed), times)
+        builder = LoadBuilder(run, tables, each, _processes(run, run.run.placed),
+                              None if times is None else times(run))
     give_back()
     placed = _placed(run, builder) if processes is None else processes(
         run.task_set, builder.times())
@@ -267,6 +268,8 @@ def reschedule(
         tables, builder.callback_of, run.names.groups, declared_first=not run.run.same)
     left_out = builder.left_out
     del builder     # the load has copies of its data
+    if recorded is None:    # of a bag only the load is needed
+        run = replace(run, columns=Columns())
     give_back()
     warnings, judge_from = run.missing.lines(), run.run.begin + skip if skip else -NEVER
     begin, judge_until = run.run.judged_releases or (-NEVER, NEVER)

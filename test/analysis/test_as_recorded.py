@@ -306,6 +306,19 @@ def test_a_completion_without_execution_is_said(tmp_path):
     assert any(re.search('unknown\n.* 1 ms\n', each) for each in times_tables(result['dags']))
 
 
+def test_a_completion_at_an_impossible_time_is_left_out(tmp_path):
+    """Before, it had a response time of minus fifty years, and there was no warning."""
+    trace = Written(tmp_path / 'a.mcap', ONE)
+    trace.release(0, 0, 0)
+    trace.add('complete', 1, 9, 0, 0, 0, True, -1, 0)
+    result = replay(trace.end(1)).result()
+    sink, = (sink for dag in result['dags'].values() for sink in dag['sinks'].values())
+    assert (sink['completed'], sink['response_ns']) == (0, None)
+    assert [text.partition(': ')[2] for text in result['warnings']] == [
+        'left out: 1 event that make no sense, most often (1) mddag:complete at an impossible '
+        'time']
+
+
 def test_a_result_before_the_release_is_said(tmp_path):
     trace = Written(tmp_path / 'a.mcap', ONE)
     trace.release(0, 0, 10, noticed=12)

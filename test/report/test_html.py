@@ -302,3 +302,21 @@ nodes:
     done = call('replay', tmp_path / 'r.mcap', '--report', tmp_path / 'b.html')
     assert (done.returncode, done.stderr) == (0, '')
     assert 'log' in (tmp_path / 'b.html').read_text()
+
+
+def test_the_verdict_names_the_paths_that_take_longer_than_required(tmp_path, call):
+    """Before, it was red, and said that all results were in time."""
+    (tmp_path / 'g.yaml').write_text("""\
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: first, timer: 10ms, publishes: [/x], execution_time: 1ms}]}
+  - {node: /b, callbacks: [{name: last, subscription: /x, deadline: 8ms, execution_time: 2ms}]}
+paths: [{name: ab, callbacks: ['/a:first', '/b:last'], age: 2ms}]
+""")
+    call('simulate', tmp_path / 'g.yaml', '--duration', '105ms', '--trace', tmp_path / 'r.mcap')
+    done = call('replay', tmp_path / 'r.mcap', '--report', tmp_path / 'r.html')
+    assert (done.returncode, done.stderr) == (0, '')
+    page = (tmp_path / 'r.html').read_text()
+    verdict = page[page.index('<div class="verdict bad">'):].partition('</div>')[0]
+    assert ('<p>ab: the required age is not met: '
+            '11 of 11 outputs later than required (2ms)</p>') in verdict

@@ -61,6 +61,20 @@ def test_everything_at_once(case, horizon, judge, stop):
     compare(case, horizon, judge, stop)
 
 
+@examples(30)
+@given(EVERY_RULE, st.integers(5, 60))
+def test_large_results_stay_where_the_core_wrote_them(case, horizon):
+    """Decisions and log have room from the beginning, and are not copied."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled, '_MANY', 0)
+        compare(case, horizon)
+        compare(case, horizon, stop=True)
+        load = case.load(horizon)
+        found = schedule(Tables.build(case.task_set), load, settings_of(
+            case, horizon, 'horizon', False), compiled=True)
+        assert not len(found.decisions) or not np.asarray(found.decisions).flags.owndata
+
+
 SLOW = 400
 """Times are multiplied by this, so that some are switch intervals and slices of a machine."""
 

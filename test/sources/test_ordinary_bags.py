@@ -3,6 +3,7 @@
 """Ordinary bags as releases: all that `ros2 bag record` can write, and damage."""
 
 from contextlib import closing
+import gc
 import os
 import random
 import re
@@ -14,6 +15,7 @@ import tracemalloc
 from mcap.writer import Writer as McapWriter
 from mddag_executor import open_recording, replay, ReplayError, reschedule
 from mddag_executor.errors import InputError
+from mddag_executor.recording.recording import Recording
 from mddag_executor.simulate import START
 from mddag_executor.sources.bag_run import read_bag
 from mddag_executor.sources.bags import Bag, UNKNOWN
@@ -72,6 +74,16 @@ def test_the_schedule_is_that_of_the_core(tmp_path):
                         (lambda: replay(bag, TASK_SET), 'no callback ran: reschedule it')):
         with pytest.raises(ReplayError, match=says):
             wrong()
+
+
+def test_only_the_load_of_a_bag_is_kept(tmp_path):
+    """A long bag's releases took half of the memory of its schedule before."""
+    bag = write_bag(tmp_path / 'bag')
+    outcome = reschedule_bag(bag, TASK_SET)
+    kept = [each for each in gc.get_objects()
+            if isinstance(each, Recording) and each.name == str(bag) and len(each.releases)]
+    assert not kept
+    assert outcome.result()['dags']['/lidar']['jobs'] == 10
 
 
 def test_stamps_that_can_not_be_are_said(tmp_path):

@@ -85,6 +85,7 @@ def test_a_run_that_misses_says_how_much_shorter_callbacks_must_be(tmp_path, cal
     out = call('slack', graph, '--report', page).stdout
     assert '300 deadlines missed: /b:last (300)' in out and 'b:last    0.49 times  b:last' in out
     assert '2 callbacks: deadlines are missed however little one alone takes' in out
+    assert 'How much longer' in page.read_text()
     assert 'a:first ' not in out and 'enough' not in out and '0.49 times' in page.read_text()
 
 
@@ -123,7 +124,8 @@ def test_where_nothing_was_due_nothing_is_proven(tmp_path, call):
     graph = tmp_path / 'g.yaml'
     graph.write_text(BY_HAND)
     arguments = 'slack', graph, '--duration', '1us'
-    out = call(*arguments).stdout
+    out = call(*arguments, '--report', tmp_path / 's.html').stdout
+    assert 'How much longer' not in (tmp_path / 's.html').read_text()  # an empty table before
     assert 'never completed, so not judged: 2 sinks: ' in out and '100 times' not in out
     status, _, err = call(*arguments, '--fail-under', '1.2')
     assert (status, err.count('\n')) == (1, 1)
