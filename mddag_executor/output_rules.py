@@ -162,9 +162,22 @@ def is_special(path: str) -> bool:
         return False
 
 
-def remove_recording(path: str) -> None:
-    """Remove what a run has recorded that could not begin (rule 4)."""
-    if os.path.isfile(path):
+def version_of(path: str) -> tuple[int, ...] | None:
+    """Return what differs when a file is written again; None: there is no file."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def remove_recording(path: str, earlier: tuple[int, ...] | None) -> None:
+    """
+    Remove what a run has recorded that could not begin (rule 4).
+
+    :param earlier: ``version_of`` the file before the run, which the run may not have replaced.
+    """
+    if os.path.isfile(path) and version_of(path) != earlier:
         os.unlink(path)
 
 

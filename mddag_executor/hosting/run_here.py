@@ -38,7 +38,7 @@ from mddag_executor.hosting.processes import Part
 from mddag_executor.hosting.run_options import RunOptions
 from mddag_executor.hosting.run_result import ProgramEnd, RunResult
 from mddag_executor.hosting.signals import Signals
-from mddag_executor.output_rules import remove_recording
+from mddag_executor.output_rules import remove_recording, version_of
 from mddag_executor.synthetic.measure import ExecutionPlan, Ledger, measure
 from mddag_executor.synthetic.workload import SyntheticWorkload
 from mddag_executor.text import listed
@@ -129,6 +129,8 @@ def run_here(
                 signals, [*task_set.concurrent, *(
                     f'/{name.lstrip("/")}' for name in options.concurrent)]))
             programs = host.load(options.nodes, ros_arguments(options.ros_args))
+        earlier = None if trace is None else version_of(str(trace))
+        begins = False
         try:
             executor = MultiDeadlineExecutor(
                 task_set, num_workers=defaults.workers(options.workers, task_set),
@@ -137,15 +139,17 @@ def run_here(
                 overwrite=options.overwrite)
             run = _Run(options, task_set, executor, display, part)
             signals.end_of(run.session)
+            begins = True
             with nullcontext() if display.output is None else redirect_stdout(display.output):
                 if host is not None:  # without progress: programs also use the terminal
                     return host.run(
                         partial(run.run_programs, host, programs, signals), display.leave)
                 assert plan is not None
                 return run.run_synthetic(plan)
-        except (MddagError, SystemExit):
-            if trace is not None:  # nothing ran: leave no empty trace behind
-                remove_recording(str(trace))
+        except (MddagError, SystemExit, KeyboardInterrupt) as error:
+            # nothing ran: leave no empty trace behind
+            if trace is not None and not (begins and isinstance(error, KeyboardInterrupt)):
+                remove_recording(str(trace), earlier)
             raise
 
 

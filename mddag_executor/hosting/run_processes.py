@@ -15,7 +15,6 @@ from pathlib import Path
 import subprocess
 import sys
 import tempfile
-import time
 from typing import Any
 
 from mddag_executor import defaults
@@ -34,7 +33,7 @@ from mddag_executor.hosting.run_options import RunOptions, spec_of
 from mddag_executor.hosting.run_result import RunResult
 from mddag_executor.hosting.signals import Signals
 from mddag_executor.laboratory.placement import packed
-from mddag_executor.output_rules import check_output, remove_recording
+from mddag_executor.output_rules import check_output, remove_recording, version_of
 from mddag_executor.simulate.execution_times import draw_execution_times
 from mddag_executor.synthetic.measure import ExecutionPlan
 from msg_graph import TaskSet
@@ -84,19 +83,20 @@ def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> R
         supervisor = Supervisor(command, options.on_exit == 'continue',
                                 display.output or sys.stdout, sys.stderr, ended)
         signals.end_of(supervisor)
-        began = time.time()
+        traces = [trace for n in names if (trace := _trace(options.trace, n)) is not None]
+        earlier = [version_of(trace) for trace in traces]
         try:
             supervisor.run(names, options.seconds)
         except ProcessError:
-            traces = [] if Part.has_begun(folder) else [_trace(options.trace, n) for n in names]
-            for trace in traces:    # not those of an earlier run
-                if trace is not None and Path(trace).exists() and os.stat(trace).st_mtime > began:
-                    remove_recording(trace)
+            if not Part.has_begun(folder):
+                for trace, version in zip(traces, earlier):
+                    remove_recording(trace, version)
             raise
         parts = [read_result(folder, run.process.pid) for run in supervisor.runs]
         has_started = signals.ended_by is None or all(
             part is not None and part['has_started'] for part in parts)
-        if signals.ended_by is not None and not any(parts):  # as if it had come before
+        if signals.ended_by is not None and not any(parts) and not any(
+                run.died for run in supervisor.runs):  # as if it had come before
             raise SystemExit(SIGNAL + signals.ended_by)
     results = {run.name: each for run, each in zip(supervisor.runs, parts) if each is not None}
     return RunResult({

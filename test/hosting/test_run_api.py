@@ -135,6 +135,21 @@ def test_what_is_wrong_is_said_in_one_line(here, given, line):
     assert not rclpy.ok()
 
 
+@pytest.mark.parametrize('where', ['MultiDeadlineExecutor', '_Run'])
+def test_an_interrupt_before_the_run_leaves_no_trace_but_an_earlier_one(here, monkeypatch, where):
+    """The first comes before the trace replaces the earlier file, the second after that."""
+    Path('run.mcap').write_text('earlier')
+
+    def interrupted(*args, **more):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f'mddag_executor.hosting.run_here.{where}', interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(RunOptions(nodes=[Node], trace='run.mcap', overwrite=True))
+    gc.collect()  # of the second, which has no one to shut it down
+    assert Path('run.mcap').exists() == (where != '_Run')
+
+
 def test_the_state_of_the_process_is_checked_first(here):
     with pytest.raises(GraphError, match='nowhere.yaml'):
         run(RunOptions(nodes=[Api], graph='nowhere.yaml'))
