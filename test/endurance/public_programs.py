@@ -60,7 +60,7 @@ from ros_domains import claim_domain
 
 TOLERANCE, FEW = 0.25, 3
 """Counts that differ by this part, or by this many messages, are the same."""
-START_S, END_S = 15.0, 45.0
+START_S, END_S = 60.0, 60.0
 """How long a program may take to publish first, and to end after SIGINT."""
 LATEST_S = 2.0
 """The latest moment of an interrupt, after the first line of the program."""
@@ -189,7 +189,7 @@ PROGRAMS = (
     Program('tesla_lane_follower', 'webots_ros2_tesla.lane_follower:main', (
         'webots_ros2/webots_ros2_tesla',)),
     Program('behavior_mirror', 'flexbe_mirror.behavior_mirror_sm:main', _FLEXBE),
-    Program('be_input', 'flexbe_input.flexbe_input:main', _FLEXBE),
+    Program('be_input', 'flexbe_input.input_action_server:main', _FLEXBE),
     Program('behavior_onboard', 'flexbe_onboard.start_behavior:main', _FLEXBE),
     Program('emergency_signal', 'rmf_demos_tasks.emergency_signal:main', (
         'rmf_demos/rmf_demos_tasks',)),
@@ -473,9 +473,10 @@ def missing(program, path):
     """Return why a program cannot run; '' if it can."""
     if not all(Path(folder).is_dir() for folder in path[:len(program.folders)]):
         return 'no sources'
-    module = program.spec.split(':')[0]
+    module, function = program.spec.split(':')
     done = subprocess.run(
-        [sys.executable, '-c', f'import {module}'], capture_output=True, text=True, check=False,
+        [sys.executable, '-c', f'from {module} import {function}'],
+        capture_output=True, text=True, check=False,
         env={**os.environ, 'PYTHONPATH': os.pathsep.join(path)}, timeout=60)
     return done.stderr.strip().splitlines()[-1] if done.returncode else ''
 
