@@ -425,7 +425,7 @@ class System:
             callback.other_keys['once'] = 'true'
         if callback.kind == 'sync':
             legs = [self._runs[number] for number, declared in self._declared.items()
-                    if declared.key == callback.key]
+                    if declared.key == callback.key and number in self._runs]
             callback.times = execution_time(np.concatenate(
                 [leg.times[leg.whole] for leg in legs or [runs]]))
         else:

@@ -70,7 +70,9 @@ def is_noted(path, killed):
     """Return whether a killed process would leave a note of the execution; copy what it leaves."""
     shutil.copy(path, killed)
     try:
-        return len(replay(killed, loads(GRAPH)).recording.unfinished) == 1
+        recording = replay(killed, loads(GRAPH)).recording
+        # on a busy machine an earlier one, whose end has not been written, may be there first
+        return len(recording.unfinished) == 1 and 'test_unfinished' in recording.names.places[0]
     except MddagError:      # nothing has been written yet
         return False
 
