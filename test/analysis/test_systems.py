@@ -125,6 +125,25 @@ def test_names_periods_and_what_no_one_declares(tmp_path):
     assert 'transition_event' not in text
 
 
+def test_a_subscription_of_diagnostics_is_an_ordinary_callback(tmp_path):
+    """The publications of a node's state are not its outputs."""
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(100, '/cam')
+    r.publisher(110, 100, '/diagnostics')
+    r.timer(1, 100, 100 * MS)
+    r.node(200, '/aggregator')
+    r.subscription(7, 200, '/diagnostics')
+    for number in range(5):
+        ran(r, 1, 1, (number + 1) * 100 * MS, MS, 110)
+        ran(r, 7, 1, (number + 1) * 100 * MS + 2 * MS, MS)
+    draft = System(r.write()).draft()
+    accept(draft)
+    callbacks = {each.node: each for each in loads(declaration_of(draft, True)).callbacks}
+    assert callbacks['/aggregator'].topics == ('/diagnostics',)
+    assert callbacks['/aggregator'].period_ns == 100 * MS
+    assert callbacks['/cam'].publishes == ()
+
+
 def test_what_comes_when_it_is_needed_is_sporadic(tmp_path):
     """Requests, and a latched topic, which a node publishes before its callbacks run."""
     r = Recorded(tmp_path / 'n.mcap')
