@@ -53,8 +53,9 @@ class Replay:
         self.warnings = list(recording.missing.lines())
         if self.judged.contradictions:
             self.warnings.append(
-                f'{recording.name}: left out: {counted(self.judged.contradictions, "event")} that '
-                'contradict earlier ones')
+                f'{recording.name}: left out: ' + counted(
+                    self.judged.contradictions, 'event that contradicts earlier ones',
+                    'events that contradict earlier ones'))
         verdicts = self.judged.verdicts
         early = (verdicts['completed'] >= 0) & (verdicts['completed'] < verdicts['release'])
         if early.any():

@@ -440,8 +440,9 @@ class _Source:
             what, n = min(self._strange.items(), key=lambda item: (-item[1], item[0]))
             total = sum(self._strange.values())
             found.append(Loss('strange', total, (
-                f'{name}: left out: {counted(total, "event")} that make no sense, most often '
-                f'({n}) {what}')))
+                f'{name}: left out: '
+                + counted(total, 'event that makes no sense', 'events that make no sense')
+                + f', most often ({n}) {what}')))
         orphans = self._executions.orphans
         if orphans:
             found.append(Loss('open', orphans, (

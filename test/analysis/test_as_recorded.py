@@ -315,7 +315,7 @@ def test_a_completion_at_an_impossible_time_is_left_out(tmp_path):
     sink, = (sink for dag in result['dags'].values() for sink in dag['sinks'].values())
     assert (sink['completed'], sink['response_ns']) == (0, None)
     assert [text.partition(': ')[2] for text in result['warnings']] == [
-        'left out: 1 event that make no sense, most often (1) mddag:complete at an impossible '
+        'left out: 1 event that makes no sense, most often (1) mddag:complete at an impossible '
         'time']
 
 
@@ -337,7 +337,8 @@ def test_a_result_before_the_release_is_said(tmp_path):
 def test_a_process_with_vertices_that_are_not_declared(trace, vertices):
     trace.add('hosted', 0, 0, vertices)
     assert replay(trace.end(110)).warnings[0].endswith(
-        '1 event that make no sense, most often (1) mddag:hosted of a vertex that is not declared')
+        '1 event that makes no sense, most often (1) mddag:hosted of a vertex that is not '
+        'declared')
 
 
 def test_a_drop_may_have_numbers_of_other_widths(trace):
