@@ -69,8 +69,9 @@ def _priority_in_time(t: Tables, s: State, x: int, now: int) -> int:
     """
     Return the priority of the first execution, from one on in its queue, that can be in time.
 
-    NEVER: there is none.  In an overload the mean execution times of those before it count.  Sinks
-    at which the given one is late are noted.
+    NEVER: there is none.  In an overload the mean execution times of those before it count.  A
+    queue whose first execution was late gets no larger priority than a late queue.  Sinks at which
+    the given one is late are noted.
     """
     vertex = s.x_vertex[x]
     if vertex == t.n_vertices:
@@ -95,11 +96,23 @@ def _priority_in_time(t: Tables, s: State, x: int, now: int) -> int:
                 deadline = min(deadline, t.reach_deadline[i])
                 start = min(start, t.reach_start[i])
         if deadline < NEVER:
-            return _priority(t, s, vertex, release, deadline, start)
+            priority = _priority(t, s, vertex, release, deadline, start)
+            queue = s.x_queue[x]
+            if s.x_state[x] != ALONE and (each != x or s.queue_demoted[queue] >= 0):
+                priority = min(priority, _aged_priority(t, s, vertex, queue, now))
+            return priority
         if s.overloaded[process] != 0:
             begin += s.mean[vertex]
         each = s.x_next[each]
     return NEVER
+
+
+def _aged_priority(t: Tables, s: State, vertex: int, queue: int, now: int) -> int:
+    """Return the largest priority of a queue whose first execution was late, since it was."""
+    if s.queue_demoted[queue] < 0:
+        s.queue_demoted[queue] = now + LATE_PATIENCE * t.late_deadline[t.dag_of[vertex]]
+    return _priority(
+        t, s, vertex, s.queue_demoted[queue], t.rad_offset[vertex], t.latest_start[vertex])
 
 
 def _late_priority(t: Tables, s: State, x: int, now: int) -> int:

@@ -63,6 +63,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     in time, the queue has the place of the first such execution, by the earliest deadline that
     this one can meet.  So a backlog is worked off.  In a lasting overload
     (``State.overloaded``) the mean execution times of the executions before it count as well.
+    But once a queue was late, or its first execution was, it has no later place than that of a
+    late queue until one of its executions starts: otherwise new executions, which can be in time,
+    would put it off again and again.
     Age and place belong to the queue: if an execution is dropped (rule 11, or live a full queue),
     the queue keeps the place and the lateness of the dropped execution.  A preempted execution
     is checked by itself.  Running executions keep their keys.  Only policies whose keys are times

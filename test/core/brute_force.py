@@ -27,7 +27,8 @@ Its reading of the documents:
   together need more than the workers, the executions before it in the queue take their time as
   well.  If no execution can be in time, the queue is ordered as if the job of its head were
   released eight relative deadlines later, until one of its executions runs; so are the later
-  vertices of that job.  A preempted execution is a queue by itself.
+  vertices of that job.  Once a head was late, the queue has no later place than that until one of
+  its executions runs, even if others can be in time.  A preempted execution is a queue by itself.
 * ``keep: newest`` at a source or sink: of two executions in a queue, the one of the earlier job is
   dropped.  With ``demote``, an execution of a timer that can make none of the deadlines that it
   leads to is dropped when a later one becomes ready.  If a late execution is dropped, its queue
@@ -214,6 +215,8 @@ class BruteForce:
                 break
         if lowest is None:
             lowest = self._late_priority(execution, not execution.has_run)
+        elif not execution.has_run and (ahead > 0 or self._at(execution) in self.demoted):
+            lowest = min(lowest, self._aged_priority(execution))
         place = self._place_of(execution)
         if lowest <= place[0]:
             return False
@@ -241,17 +244,27 @@ class BruteForce:
         """Return the priority eight deadlines after the execution or its queue was late first."""
         job, key = execution.job, self._at(execution)
         since = [each for each in (job.demoted, self.demoted.get(key) if in_queue else None)
-                 if each is not None]
-        if not since:
-            deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
-            since = [self.now * self.tick + 8 * deadline]
+                 if each is not None] or [self._later(job)]
         if job.demoted is None:
             job.demoted = min(since)
         if in_queue:
             self.demoted[key] = min(since)
+        return self._released_at(execution, min(since))
+
+    def _aged_priority(self, execution):
+        """Return the priority eight deadlines after the head of the queue was late first."""
+        since = self.demoted.setdefault(self._at(execution), self._later(execution.job))
+        return self._released_at(execution, since)
+
+    def _later(self, job):
+        deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
+        return self.now * self.tick + 8 * deadline
+
+    def _released_at(self, execution, release):
+        """Return the priority of an execution if its job had been released at a time, ns."""
         unit = 1 if self.policy == 'llf' else self.tick
         return self._priority(execution, {*self._starts(execution)}) + (
-            min(since) - job.release * self.tick) // unit
+            release - execution.job.release * self.tick) // unit
 
     def _priority(self, execution, sinks):
         job = execution.job

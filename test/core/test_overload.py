@@ -235,6 +235,52 @@ def test_no_callback_starves(case, heavier):
             assert start - waits_since <= most, (dag, last, waits_since, start)
 
 
+def chain(name, period, deadline, times):
+    """Declare a DAG of callbacks one after the other, each with its execution time; in ticks."""
+    last = len(times) - 1
+    return [{'node': f'/{name}{place}', 'name': f'{name}{place}', 'execution_time': f'{time}us',
+             **({'publishes': [f'/{name}{place}']} if place < last else {'deadline': deadline}),
+             **({'subscription': f'/{name}{place - 1}'} if place else {
+                 'timer': f'{period}us', 'dag': name, 'on_late': 'demote'})}
+            for place, time in enumerate(times)]
+
+
+@pytest.mark.parametrize('capacity', [2, 5, 13, 20])
+def test_no_dag_of_several_callbacks_starves(capacity):
+    """
+    Each callback starts again and again, however far the load is above the capacity.
+
+    One sink of the short DAG is never in time.  When its source comes first, it has a release that
+    can be in time at the other sink, but later than all the late work that the others have.
+    """
+    short = [1, 2, 2, 2, 1]
+    others = [(100, 60, (40, 60, 90)), (50, 45, (30, 80)), (50, 33, (17, 17)), (100, 74, (70, 40)),
+              (50, 30, (30, 35))]
+    usual = sum(sum(times) / period for period, _, times in others)
+    rows = [tuple(max(1, round(time * (capacity - 0.3) / usual)) for time in times)
+            for _, _, times in others]
+    task_set = declaration([
+        *chain('short', 10, '6us', short[:4]),
+        {'node': '/quick', 'name': 'quick', 'subscription': '/short0', 'deadline': '9us',
+         'execution_time': '1us'}, *(
+            each for number, ((period, deadline, _), row) in enumerate(zip(others, rows))
+            for each in chain(f'd{number}x', period, f'{deadline}us', row))])
+    case = Case(task_set, (tuple(short), *rows), 1, 'rad', False)
+    each_once = sum(map(sum, case.ticks))
+    horizon = 40 * each_once
+    starts = {}
+    load = case.load(horizon)
+    for time, kind, _, dag, vertex, _ in case.events(simulated(case, load, horizon)):
+        if kind == 'start':
+            starts.setdefault((dag, vertex), [0]).append(time)
+    assert len(starts) == len(task_set.vertices)
+    for (dag, _), times in starts.items():
+        longest = max(after - before for before, after in zip(times, [*times[1:], horizon]))
+        assert longest <= 12 * max(
+            task_set.dags[dag].vertices[sink].deadline_ns for sink in task_set.dags[dag].sinks
+        ) / TICK + 4 * each_once, (dag, times[-3:])
+
+
 def test_a_measured_time_that_is_not_renewed_is_forgotten():
     """If a callback no longer runs, or runs seldom, its declared time counts again."""
     scheduler = live(with_times(case_of(timer('a', 10, 10, 4), timer('b', 10, 10, 4))).task_set)
