@@ -189,11 +189,11 @@ def expire_idle(t: Tables, s: State, dag: int, now: int) -> None:
     """Expire the jobs of a DAG that can no longer complete (rule 1), the oldest first."""
     if t.expire_after[dag] >= NEVER:
         return
-    patience = t.dag_deadline[dag] + t.expire_after[dag]
+    longest = t.dag_deadline[dag] + t.expire_after[dag]
     slot = s.oldest[dag]
     while slot >= 0:  # all of them: releases from messages may be out of order
         after = s.job_next[slot]
-        if s.job_active[slot] == 0 and now - s.job_release[slot] > patience:
+        if s.job_active[slot] == 0 and now - s.job_release[slot] > longest:
             give_up(t, s, slot, EXPIRED, now)
         slot = after
 

@@ -30,7 +30,7 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import IMPORTANT, NEVER, Tables
 
-LATE_PATIENCE = 8
+LATE_DEADLINES = 8
 """
 A late queue is ordered as if it were released this many relative deadlines later.
 
@@ -110,7 +110,7 @@ def _priority_in_time(t: Tables, s: State, x: int, now: int) -> int:
 def _aged_priority(t: Tables, s: State, vertex: int, queue: int, now: int) -> int:
     """Return the largest priority of a queue whose first execution was late, since it was."""
     if s.queue_demoted[queue] < 0:
-        s.queue_demoted[queue] = now + LATE_PATIENCE * t.late_deadline[t.dag_of[vertex]]
+        s.queue_demoted[queue] = now + LATE_DEADLINES * t.late_deadline[t.dag_of[vertex]]
     return _priority(
         t, s, vertex, s.queue_demoted[queue], t.rad_offset[vertex], t.latest_start[vertex])
 
@@ -125,7 +125,7 @@ def _late_priority(t: Tables, s: State, x: int, now: int) -> int:
             release < 0 or s.queue_demoted[queue] < release):
         release = s.queue_demoted[queue]
     if release < 0:
-        release = now + LATE_PATIENCE * t.late_deadline[t.dag_of[vertex]]
+        release = now + LATE_DEADLINES * t.late_deadline[t.dag_of[vertex]]
     if s.job_demoted[slot] < 0:
         s.job_demoted[slot] = release
     if queue >= 0:
@@ -254,7 +254,7 @@ def note_late(t: Tables, s: State, sink: int, now: int) -> None:
         return  # late jobs of the DAG are not demoted, or it must itself give way
     process = s.process[sink]
     if t.importance[sink] >= s.late_importance[process]:
-        s.late_until[process] = now + LATE_PATIENCE * t.sink_deadline[sink]
+        s.late_until[process] = now + LATE_DEADLINES * t.sink_deadline[sink]
     if t.importance[sink] > s.late_importance[process]:
         s.late_importance[process] = t.importance[sink]
         admit(t, s)

@@ -55,7 +55,7 @@ from mddag_executor.core.tables import Tables
 
 TURN_NS = 1_000_000
 """No overtaking if the holder needs less time than this: Python switches threads no sooner."""
-PATIENCE = 2
+LONG_WAITS = 2
 """Overtaking pays if the wait for the interpreter, times this, reaches RAD minus release."""
 
 
@@ -305,12 +305,12 @@ def overtaking_pays(
     left = abs(usual - held)
     if left < TURN_NS or preempts:
         return left >= TURN_NS
-    return first < 0 or PATIENCE * left >= t.rad_offset[s.x_vertex[first]]
+    return first < 0 or LONG_WAITS * left >= t.rad_offset[s.x_vertex[first]]
 
 
 def overtaking_pays_from(
     t: Tables, s: State, first: int, usual: int, preempts: bool
 ) -> int:
     """Return after which time of holding the interpreter overtaking pays again, ns."""
-    wait = 0 if first < 0 or preempts else -(-t.rad_offset[s.x_vertex[first]] // PATIENCE)
+    wait = 0 if first < 0 or preempts else -(-t.rad_offset[s.x_vertex[first]] // LONG_WAITS)
     return usual + max(TURN_NS, wait)

@@ -56,7 +56,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
 7.  **Late queues.**  With ``CONTINUE``, late work goes on as before.  With ``DEMOTE``, a queue
     that comes first is *late* if none of its executions can be in time at any of their sinks: the
     time plus the mean execution times on the longest path to the sink is past its deadline.  Until
-    one of its executions starts, a late queue counts as released ``LATE_PATIENCE`` relative
+    one of its executions starts, a late queue counts as released ``LATE_DEADLINES`` relative
     deadlines later, and so does the job of its first execution at all later vertices.  (In a DAG
     without any deadline it does not: its relative deadline is ten periods already.)  So late
     work ages, and each callback gets some time.  As long as another execution in the queue can be
@@ -101,7 +101,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     trigger and queue edges.  While an important sink is late, or the known execution times demand
     more than the workers or the interpreter of a process can give, work of lower importance is
     demoted as if it were late (rule 7), and nothing more.  A sink counts as late for
-    ``LATE_PATIENCE`` of its relative deadlines.  If the demand is too high, the lowest importance
+    ``LATE_DEADLINES`` of its relative deadlines.  If the demand is too high, the lowest importance
     is demoted, as many levels as necessary, but never the highest.
 13. **Not due.**  A vertex may publish some of its topics only sometimes.  If it completes without
     one of them, the vertices that the topic leads to, and all after these, are not due in the job
@@ -292,7 +292,7 @@ def drop(t: Tables, s: State, x: int, now: int) -> None:
     s.decisions.append((DROP, dag, s.x_vertex[x], s.job_index[slot], x, now))
     group = s.x_group[x]
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
-        _release_group(s, group)  # its entry may have been its group's in the ready heap
+        _free_group(s, group)  # its entry may have been its group's in the ready heap
     s.x_aside[x] = -1
     _let_others(s, x)  # or that of its outer group
     if dag == len(s.free_slot):
@@ -354,7 +354,7 @@ def let_group(s: State, x: int) -> None:
     """Let others of the callback group of an execution that cannot start yet go first."""
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == -1:
-        _release_group(s, group)
+        _free_group(s, group)
 
 
 def _let_others(s: State, x: int) -> None:
@@ -429,7 +429,7 @@ def lend(s: State, x: int) -> None:
 
 
 def stop_holding(s: State, x: int) -> None:
-    """Release the interpreter for an execution that turns out not to hold it (rule 10)."""
+    """Give up the interpreter for an execution that turns out not to hold it (rule 10)."""
     if s.x_worker[x] >= 0:
         s.scalars[N_HOLDING] -= int(s.x_holds[x] != 0)
     s.x_holds[x] = 0
@@ -453,7 +453,7 @@ def leave_group(s: State, x: int) -> None:
     """Let a running execution go on without its group, which becomes free (rule 4)."""
     group = s.x_group[x]
     s.x_group[x] = -1
-    _release_group(s, group)
+    _free_group(s, group)
 
 
 def ask_again(s: State, x: int) -> None:
@@ -517,7 +517,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     if group >= 0 and s.group_owner[group] == x:
         s.group_owner[group] = -1
         if s.group_heap[group]:
-            _release_group(s, group)
+            _free_group(s, group)
     vertex = s.x_vertex[x]
     if vertex == t.n_vertices:
         s.undeclared.append(x)
@@ -591,7 +591,7 @@ def fail(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     return complete(t, s, key, x, now)
 
 
-def _release_group(s: State, group: int) -> None:
+def _free_group(s: State, group: int) -> None:
     s.group_owner[group] = -1
     heap = s.group_heap[group]
     if heap:
