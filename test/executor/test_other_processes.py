@@ -135,8 +135,9 @@ def test_a_dag_leaves_and_comes_back_to_the_same_job(make_executor, make_node):
     assert nodes.jobs('sink') == nodes.jobs('first')
     assert {(b.release_ns - a.release_ns) % (20 * MS) for a, b in zip(
         nodes.jobs('sink')[1:], nodes.jobs('sink')[2:])} == {0}
-    skipped = outer.statistics()['callbacks']['/sensor:tick']['skipped']
-    assert outer.statistics()['dags']['chain']['jobs'] == n + skipped
+    tick = outer.statistics()['callbacks']['/sensor:tick']
+    assert outer.statistics()['dags']['chain']['jobs'] == (
+        n + tick['skipped'] + tick['dropped'])  # if the machine is busy
     assert ends(outer)['completed'] == ends(inner)['completed'] == n
 
 
