@@ -57,7 +57,7 @@ UNFIT = ([], [[1]], ['x'], np.array([{}]), [1, -1], [1, float('nan')], [10 ** 18
 
 @pytest.mark.parametrize(('content', 'problem'), [
     (b'', 'this is not a .npz file'), (npz(**GOOD)[:-30], 'this is not a .npz file'),
-    *((npz(**{**GOOD, '/n:b': values}), 'the values of /n:b are damaged, or no list of ns')
+    *((npz(**{**GOOD, '/n:b': values}), 'the values of /n:b are damaged, or not a list of ns')
       for values in UNFIT),
 ])
 def test_bad_samples(task_set, tmp_path, content, problem):
