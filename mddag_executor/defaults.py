@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""Defaults of command line and declaration: the paper's experiment."""
+"""Constants that several parts share; most are defaults of the paper's experiment."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ DURATION_NS = 3_000_000_000
 """Virtual time of a simulated run."""
 BUDGETS = ('max', 'p99', 'mean')
 """Which value of a declared execution time an analysis may count."""
+SAME_SIGNAL_S = 1.0
+"""Signals within this time are one: `timeout` sends one to the process, and one to its group."""
 
 
 def workers(asked: int | None, task_set: TaskSet | None) -> int:

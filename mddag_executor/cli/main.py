@@ -30,8 +30,8 @@ from mddag_executor import __version__
 from mddag_executor.cli.parsing import Parser, unknown, verb_parser
 from mddag_executor.cli.text import label, one_line, set_quiet
 from mddag_executor.cli.verbs import load, REMOVED, TASKS, VERBS
+from mddag_executor.defaults import SAME_SIGNAL_S
 from mddag_executor.errors import from_user_code, MddagError, UsageError, UserCodeError
-from mddag_executor.hosting.signals import SAME_SIGNAL_S
 
 EXIT_BAD_INPUT = 2
 EXIT_DEFECT = 70

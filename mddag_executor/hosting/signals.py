@@ -28,10 +28,9 @@ import time
 from types import FrameType
 from typing import Any, Protocol
 
+from mddag_executor.defaults import SAME_SIGNAL_S
 from mddag_executor.executor.interrupts import handler_of
 
-SAME_SIGNAL_S = 1.0
-"""Signals within this time are one: `timeout` sends one to the process, and one to its group."""
 _NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 

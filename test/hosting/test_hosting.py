@@ -15,11 +15,11 @@ import threading
 import time
 
 from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.defaults import SAME_SIGNAL_S
 from mddag_executor.executor.session import Session
 from mddag_executor.hosting.guest import Guest
 from mddag_executor.hosting.host import Host
 from mddag_executor.hosting.loading import LoadingError, Program, resolve
-from mddag_executor.hosting.signals import SAME_SIGNAL_S
 import pytest
 import rclpy
 from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
