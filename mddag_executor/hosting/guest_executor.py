@@ -143,6 +143,26 @@ class GuestExecutor:
             timeout_sec = _STEP_S
         if self.guest is not None and self.host.is_over(self.guest):
             raise ExternalShutdownException()
+        self._wait(until, timeout_sec, is_step=True)
+
+    def _wait(self, until: Callable[[], bool], timeout_sec: Any, is_step: bool = False) -> None:
+        error: BaseException | None = None
+        try:
+            with InterruptsDeferred():
+                let_run = self._let_step if is_step else self._let_run
+                error = let_run(until, timeout_sec)
+        except KeyboardInterrupt as interrupt:
+            self.host.note_interrupt()
+            if error is not None:  # the next spin raises it
+                self._errors.appendleft(error)
+            error = interrupt
+        if isinstance(error, KeyboardInterrupt):
+            self._await_callbacks()
+        if error is not None:
+            raise error
+
+    def _let_step(self, until: Callable[[], bool], timeout_sec: Any) -> BaseException | None:
+        """Let the nodes run until a callback has run, or a condition is true; see ``_let_run``."""
         with self._lock:
             self._n_stepping += 1
         # callbacks that are in no group also run between two spins
@@ -156,28 +176,13 @@ class GuestExecutor:
                 group.n_nested <= (group.number == own) for group in groups)
 
         try:
-            self._wait(lambda: has_ended() or until(), timeout_sec, is_step=True)
+            return self._let_run(lambda: has_ended() or until(), timeout_sec, is_step=True)
         finally:
             with self._lock:
                 self._n_stepping -= 1
 
-    def _wait(self, until: Callable[[], bool], timeout_sec: Any, is_step: bool = False) -> None:
-        error: BaseException | None = None
-        try:
-            with InterruptsDeferred():
-                error = self._let_run(until, timeout_sec, is_step)
-        except KeyboardInterrupt as interrupt:
-            self.host.note_interrupt()
-            if error is not None:  # the next spin raises it
-                self._errors.appendleft(error)
-            error = interrupt
-        if isinstance(error, KeyboardInterrupt):
-            self._await_callbacks()
-        if error is not None:
-            raise error
-
     def _let_run(
-        self, until: Callable[[], bool], timeout_sec: Any, is_step: bool
+        self, until: Callable[[], bool], timeout_sec: Any, is_step: bool = False
     ) -> BaseException | None:
         """Let the nodes run until a condition is true; return what a callback has raised."""
         self.has_spun = True

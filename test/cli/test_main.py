@@ -20,7 +20,7 @@ from types import ModuleType
 from hypothesis import given, strategies
 from mddag_executor import __version__
 from mddag_executor.cli import main as program
-from mddag_executor.cli.text import format_ns, one_line, printable, Progress
+from mddag_executor.cli.text import format_ns, one_line, printable, Progress, set_quiet
 from mddag_executor.errors import InputError, MddagError
 from msg_graph import errors
 import pytest
@@ -244,6 +244,7 @@ def test_both_packages_make_names_harmless_alike():
 
 
 def test_progress_waits_two_seconds():
+    set_quiet(False)  # as a command that ran before may have left it
     stream, now = io.StringIO(), [100.0]
     stream.isatty = lambda: True
     with Progress('simulating', 10, stream=stream, clock=lambda: now[0]) as progress:
