@@ -87,7 +87,7 @@ REJOIN_NS = 100_000_000
 """
 How long a callback waits for its worker after ``Client.call`` before it checks what keeps it.
 
-If nothing has ended and nothing has computed meanwhile, it goes on without a worker.
+If no execution has ended and no running callback has computed meanwhile, it goes on without one.
 """
 
 END_S = 1.0

@@ -10,16 +10,15 @@ left than there are workers, a thread is made.  At most ``MOST`` callbacks lend 
 further ones keep their workers.  When it has its answer, it *rejoins*: it waits in the core like
 any other execution, and its thread waits for its permit.  The thread that dispatches it hands its
 worker over, and chooses again.  All workers may run callbacks that wait for this one (it may own a
-lock).  So if in ``REJOIN_NS`` no execution has ended, and the process has computed nothing, it
-goes on without a worker; as it does when a spin ends, or in ``spin_once``, where only one callback
-runs.
+lock).  So if in ``REJOIN_NS`` no execution has ended, and the running callbacks have computed
+nothing, it goes on without a worker; as it does when a spin ends, or in ``spin_once``, where only
+one callback runs.  Other threads of the program may compute meanwhile: they need no worker.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from time import process_time_ns
 from typing import Any, Protocol
 
 from mddag_executor.executor.bounds import ALONE_NS, MOST, REJOIN_NS
@@ -53,6 +52,9 @@ class Pool(Protocol):
 
     def tick(self) -> int:
         """Return the engine's time now."""
+
+    def cpu_of_running(self) -> int:
+        """Return the CPU time (ns) of the threads whose callbacks run with a worker."""
 
     def become(self, me: WorkerThread, state: ThreadState) -> None:
         """Change the state of a thread."""
@@ -146,10 +148,10 @@ class Lending:
                 pool.wake_for(step, now)
             else:
                 pool.call()
-            seen = pool.n_ended, process_time_ns()
+            seen = pool.n_ended, pool.cpu_of_running()
         while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
             with pool.lock:
-                before, seen = seen, (pool.n_ended, process_time_ns())
+                before, seen = seen, (pool.n_ended, pool.cpu_of_running())
                 if work in self.rejoining and engine.waits_for_place(work) and (
                         pool.now - now < ALONE_NS):
                     pool.tick()     # it is not to overlap with the one that has its place

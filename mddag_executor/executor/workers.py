@@ -703,6 +703,11 @@ class WorkerPool:
         return {(each.ident, each.end): cpu_ns(each.ident)
                 for each in self._threads if each.work is None and each.ident}
 
+    def cpu_of_running(self) -> int:
+        """Return the CPU time (ns) of the threads whose callbacks run with a worker."""
+        return sum(cpu_ns(each.ident) for each in self._threads
+                   if each.state is ThreadState.RUNNING and each.work is not None)
+
     # --- executions ------------------------------------------------------------------------------
 
     def _report_unusual_end(self, me: WorkerThread, work: Work, now: int) -> None:

@@ -28,7 +28,7 @@ class Guest:
     :ivar done: is set when all that follows its main is also done.
     :ivar signals: those that rclpy handles for it, with the Python handler of each at that time,
         which rclpy's calls.
-    :ivar interrupted: whether a SIGINT has come that its next spin raises.
+    :ivar interrupted: whether a SIGINT has come that its next spin, or ``rclpy.ok()``, raises.
     :ivar waited_ns: how long its callbacks have waited for others of it, in groups that it has
         closed.
     """

@@ -142,6 +142,8 @@ class GuestExecutor:
         if self.guest is None and self.is_global:  # for rclpy.spin_once in a callback
             timeout_sec = _STEP_S
         if self.guest is not None and self.host.is_over(self.guest):
+            if self.host.take_interrupt(self.guest):
+                raise KeyboardInterrupt
             raise ExternalShutdownException()
         self._wait(until, timeout_sec, is_step=True)
 

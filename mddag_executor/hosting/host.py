@@ -662,6 +662,8 @@ class Host:
 
     def _ok(self) -> bool:
         guest = self.current_guest()
+        if self.take_interrupt(guest):  # it came between two spins; alone it would be raised there
+            raise KeyboardInterrupt
         if self._is_ending() and (guest is not None or self._is_of_callback()):
             return False  # but for the executor's own threads it is until the very end
         return Context.ok(self.context) and not (guest is not None and guest.ended)

@@ -525,14 +525,17 @@ def test_goals_of_an_action_are_told_apart_by_their_callback():
 
 
 def test_workers_that_wait_for_a_callback_do_not_keep_it_waiting(make_executor, make_node):
-    """It may own a lock: if all workers wait, it goes on without one."""
+    """It may own a lock: if all workers wait, it goes on without one, whatever else computes."""
     lending = Lending(make_executor, make_node, 2, lends='50s', waits='40s', other_waits='40s')
     lending.then = lending.leave.set
+    of_program = threading.Thread(target=lending.compute)
     with Spinning(lending.executor):
         for name in ('lends', 'waits', 'other_waits'):
             lending.start(name)
+        of_program.start()
         lending.bell.set()
         assert wait_for(lambda: is_idle(lending.executor))
+    of_program.join()
     assert lending.ran[3:] == ['goes on', 'ends']
 
 
