@@ -126,13 +126,26 @@ def last_before(times: Any, wanted: Any) -> Ints:
 
 def equal_pairs(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[Ints, Ints]:
     """Return by wanted pair the first known one, ``UNKNOWN`` without, and their number."""
-    values, second = np.unique(np.append(known[1], wanted[1]), return_inverse=True)
-    keys = np.append(known[0], wanted[0]) * len(values) + second
-    n = len(known[0])
-    keys, wanted_keys = keys[:n], keys[n:]
-    keys, first, count = np.unique(keys, return_index=True, return_counts=True)
-    at = equal(keys, wanted_keys)
-    return np.append(first, UNKNOWN)[at], np.append(count, 0)[at]
+    keys, wanted_keys = _pair_keys(known, wanted)
+    order = sort_by(keys)
+    begins, until = groups(keys[order])
+    at = equal(keys[order[begins]], wanted_keys)
+    return np.append(order[begins], UNKNOWN)[at], np.append(until - begins, 0)[at]
+
+
+def _pair_keys(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[Ints, Ints]:
+    """Return one number for each pair, in the order of the pairs."""
+    first, second = (np.append(*both) for both in zip(known, wanted))
+    if not len(first):
+        return first, first
+    least, span = int(second.min()), int(second.max()) - int(second.min()) + 1
+    if max(abs(int(first.min())), abs(int(first.max()))) < 2 ** 62 // span:
+        second -= least
+    else:
+        values, second = different(second)
+        span = len(values)
+    keys = first * span + second
+    return keys[:len(known[0])], keys[len(known[0]):]
 
 
 def groups(values: Any) -> tuple[Ints, Ints]:

@@ -31,7 +31,7 @@ import numpy as np
 ADDRESSES = 2 ** 64
 
 (START, END, INTRA, RCLCPP, RCL, DDS_WRITE, BECAME, BIND, RMW_PUBLISH, DISPATCH, TAKE, WITHIN,
- COPY, ENQUEUE, DEQUEUE, LOST, READY, SHUTDOWN) = range(18)
+ COPY, ENQUEUE, DEQUEUE, LOST, SHUTDOWN) = range(17)
 
 KINDS: dict[str, tuple[Any, ...]] = {
     'ros2_caret:dds_write': (DDS_WRITE, 'message', 'timestamp_'),
@@ -54,10 +54,18 @@ KINDS: dict[str, tuple[Any, ...]] = {
 }
 """By full name of an event its kind, and the fields of its columns ``a``, ``b``, …"""
 OWN_KINDS: dict[str, tuple[Any, ...]] = {
-    'mddag:dispatch': (READY, 'callback', 'ready', 'due'), 'mddag:shutdown': (SHUTDOWN, 'end'),
+    'mddag:dispatch': (START, 'callback', 'ready', 'due'),
+    'ros2:callback_end': KINDS['ros2:callback_end'],
+    'ros2:rclcpp_publish': KINDS['ros2:rclcpp_publish'],
     'ros2:rmw_take': (
-        TAKE, 'rmw_subscription_handle', 'source_timestamp', 'taken', 'sequence_number')}
-"""The same of this executor's own events, for a trace without declaration."""
+        TAKE, 'rmw_subscription_handle', 'source_timestamp', 'taken', 'sequence_number'),
+    'mddag:lost': KINDS['mddag:lost'], 'mddag:shutdown': (SHUTDOWN, 'end')}
+"""
+The same for a trace of this executor without declaration.
+
+`callback_start` and `rcl_publish` are not in it: they say the same as `dispatch` and
+`rclcpp_publish`, with which they are recorded.
+"""
 
 _INIT_TIME = 'init_timestamp'
 """The field of a timer's initialisation that is a time."""
@@ -152,8 +160,10 @@ def read_events(
     warning = '' if not impossible else (
         f'left out: {counted(len(impossible), "event")} at an impossible time, the first at '
         f'{impossible[0]} ns')
+    if not possible.all():
+        table = table[possible]
     return Events(
-        table[possible], [(each >> 32, (each & 0xFFFFFFFF) - (each & 0x80000000) * 2)
+        table, [(each >> 32, (each & 0xFFFFFFFF) - (each & 0x80000000) * 2)
                           for each in threads.tolist()], kept, warning, names_of)
 
 

@@ -40,7 +40,7 @@ from mddag_executor.core import EXPIRE_AFTER_NS, legs_of, Tables
 from mddag_executor.core.driven import Awaiting
 from mddag_executor.core.tables import DRIVEN
 from mddag_executor.recording.columns import Ints, Mask, rows, Table
-from mddag_executor.recording.joins import equal_pairs, rows_by, sort_by
+from mddag_executor.recording.joins import distinct, equal_pairs, groups, rows_by, sort_by
 from mddag_executor.recording.mapping import Target
 from mddag_executor.recording.tables import (
     EXPIRED,
@@ -243,14 +243,23 @@ class ImportedJobs:
         vertex = self._vertex[done]
         n_legs = np.array(self._tables.n_legs)[vertex]
         whole: Mask = n_legs == 1
-        legs: dict[tuple[int, int], set[int]] = {}
-        for each in np.flatnonzero(~whole).tolist():
-            key = int(vertex[each]), int(self._row[done[each]])
-            so_far = legs.setdefault(key, set())
-            so_far.add(int(self._leg[done[each]]))
-            if len(so_far) == n_legs[each]:
-                whole[each] = True
-                del legs[key]
+        several = np.flatnonzero(~whole)
+        several = several[sort_by(self._row[done[several]], vertex[several])]
+        row, vertex = self._row[done[several]], vertex[several]
+        cell, leg = row * len(self._after) + vertex, self._leg[done[several]]
+        begins, until = groups(cell)
+        full = until - begins >= n_legs[several[begins]]
+        whole[several[begins[full] + n_legs[several[begins[full]]] - 1]] = True
+        # legs of which several messages came
+        pairs = np.sort(cell * (leg.max(initial=0) + 1) + leg)
+        again = distinct(pairs[1:][pairs[1:] == pairs[:-1]] // (leg.max(initial=0) + 1))
+        legs: dict[int, set[int]] = {}
+        for place in np.flatnonzero(np.isin(cell, again)).tolist():
+            each, so_far = several[place], legs.setdefault(int(cell[place]), set())
+            so_far.add(int(leg[place]))
+            whole[each] = len(so_far) == n_legs[each]
+            if whole[each]:
+                del legs[int(cell[place])]
         return whole
 
     def _closed(self) -> Ints:

@@ -98,10 +98,9 @@ class ImportedRun:
             self._events = self._with_unfinished(read_events(
                 reader, self.kinds, self.others, progress))
         give_back()     # memory of the batches
-        starts = self._starts()
         # this executor recorded it, but its executions are lost
         own = any(event[0].name in _OWN for event in self._events.others)
-        if head is None and (own or not len(starts)):
+        if head is None and (own or not (self._events.table['kind'] == START).any()):
             raise no_run(reader)
         self._link()
         self._clocks = ImportedClocks(self.links, {
@@ -109,11 +108,10 @@ class ImportedRun:
         if self._clocks.shift:
             self._events = moved(self._events, self._clocks.shift)
             self._link()
-            starts = self._starts()
-        threads = {self._events.threads[each] for each in distinct(starts['thread']).tolist()}
         # The policy of another executor is not recorded; its name replaces the pool.
         self.head = head or Head(
-            int(starts['time'][0]), '', '', 'ros2', len(threads), DEFAULT_DEADLINE_NS, 0, False)
+            int(self.links.runs['start'][0]), '', '', 'ros2', len(distinct(
+                self.links.runs['thread'])), DEFAULT_DEADLINE_NS, 0, False)
         self._imported = head is None
         self._matching = Matching(name, self.who.names, task_set)
         #: The declaration to judge by; none is recorded.
@@ -126,11 +124,6 @@ class ImportedRun:
         self.end = max(min(max(0, self.head.time), NEVER - 1), *self._last_times())
         self._odd = Oddities(self.odd, 5)
         self._fallbacks: Counter[str] = Counter()
-
-    def _starts(self) -> Table:
-        table = self._events.table
-        starts: Table = table[table['kind'] == START]
-        return starts
 
     def _link(self) -> None:
         """Link executions and messages."""

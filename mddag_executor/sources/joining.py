@@ -14,12 +14,12 @@ Each trace becomes a recording; their tables are merged in the order of time.
 2. *Numbers.*  Addresses are unique within a process; the number of the trace is added above their
    48 bits.  Workers are numbered consecutively.  A process or thread id that another trace
    also uses (containers, other machines) is replaced by an unused one.
-3. *Jobs* are renumbered in the order of their first release.  Releases of two processes belong to
-   the same job if they are equal within ``SAME_RELEASE``: releases of a burst are closer, so the
-   nearest one counts, of equally near ones the oldest.  If header stamps join the jobs of a DAG,
-   a release also belongs to the job that was released up to one period of the DAG earlier:
-   the stamp is later than the timer was due.  Any other release is a new job.  A stamp is a time
-   of the source machine's clock, no matter which machine recorded it.
+3. *Jobs* (``joined_jobs``) are renumbered in the order of their first release.  Releases of two
+   processes belong to the same job if they are equal within ``SAME_RELEASE``: releases of a burst
+   are closer, so the nearest one counts, of equally near ones the oldest.  If header stamps join
+   the jobs of a DAG, a release also belongs to the job that was released up to one period of the
+   DAG earlier: the stamp is later than the timer was due.  Any other release is a new job.  A
+   stamp is a time of the source machine's clock, no matter which machine recorded it.
 4. If several processes run a DAG, the vertices of all of them are expected.  Jobs are judged as
    soon as all processes that existed at the beginning judge.
 5. A process without recorded end was killed.  Its open jobs are reported, and the run continues.
@@ -30,7 +30,6 @@ Each trace becomes a recording; their tables are merged in the order of time.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import os
@@ -50,18 +49,16 @@ from mddag_executor.sources import clocks
 from mddag_executor.sources.entities import Entities
 from mddag_executor.sources.executions import Numbering
 from mddag_executor.sources.head import declared, read_head
+from mddag_executor.sources.joined_jobs import JoinedJobs, Released
 from mddag_executor.sources.own import begin_of, end_losses, Read, read_process
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.numbers import Numbers
-from mddag_executor.trace.schema import EVENTS, HOST
-from msg_graph import Dag, Process
+from mddag_executor.trace.schema import EVENTS
+from msg_graph import Process, TaskSet
 import numpy as np
 
-SAME_RELEASE = 100_000
-_KEPT = 1024
 _BITS = 48
-_INIT, _SHUTDOWN, _JUDGE_FROM = 'ros2_caret:caret_init', 'mddag:shutdown', 'mddag:judge_from'
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
 _TIMES = {
     'releases': ('release', 'noticed'), 'executions': ('ready', 'began', 'start', 'end'),
@@ -87,7 +84,6 @@ class _Part:
     One trace: the position of its times, workers and addresses in the joined recording.
 
     :ivar ran: by vertex the time of its first and last execution.
-    :ivar hosted: by DAG the vertices that run here; only if some run elsewhere.
     :ivar number: by release the number of its job; ``is_first``: whether no other process released
         it before; ``expected``: the number of legs to complete here.
     :ivar open_jobs: DAGs and numbers of the jobs that are open at the end.
@@ -112,15 +108,8 @@ class _Part:
                 path, 'it was recorded without a declaration, so its jobs have no names that '
                 'other traces know', 'replay it by itself, with a GRAPH')
         self.head: Head = head
-        last = {event[0]: event[4:] for event in self.reader.events(
-            {_INIT, HOST, _SHUTDOWN, _JUDGE_FROM}) if None not in event}
-        self.clock: int = last.get(_INIT, (0,))[0]
-        self.boot: str = last.get(HOST, ('', ''))[1]
-        self.end: int | None = last.get(_SHUTDOWN, (None,))[0]
-        self.judges_from: int = last.get(_JUDGE_FROM, (0,))[0]
         self.shift = self.last = 0
         self.label = label_of(path)
-        self.hosted: dict[int, frozenset[int]] = {}
 
     @property
     def first(self) -> int:
@@ -128,23 +117,15 @@ class _Part:
         return self.head.time + self.shift
 
     def read(
-        self, who: Entities, threads: Numbers, workers: int, count: int, progress: Progress | None
+        self, task_set: TaskSet, who: Entities, threads: Numbers, workers: int, count: int,
+        progress: Progress | None,
     ) -> None:
-        """Read its tables, with joined times, addresses and ``workers`` (rules 1 and 2)."""
+        """Read its tables, with joined addresses and ``workers`` (rule 2), by its own clock."""
         found = self.found = read_process(
-            self.reader, self.name, self.head, who, self._edited,
+            self.reader, self.name, self.head, task_set, who, self._edited,
             None if progress is None else lambda more: progress(count + more))
         tables = found.tables
         self.seen_at = found.seen_at
-        if self.shift:
-            self.seen_at = self.seen_at + self.shift
-            for name, columns in _TIMES.items():
-                for column in columns:
-                    times = tables[name][column]
-                    times[times > 0] += self.shift
-            if found.run.notices_stops is not None:
-                found.run = replace(
-                    found.run, notices_stops=found.run.notices_stops + self.shift)
         for addresses in (
                 tables['executions']['callback'], tables['losses']['callback'],
                 tables['unfinished']['callback'], tables['publications']['publisher']):
@@ -157,6 +138,19 @@ class _Part:
         numbers, of = different(thread)
         thread[:] = np.array([threads.of(self.place, each) for each in numbers.tolist()],
                              dtype=np.int64)[of]
+
+    def move(self) -> None:
+        """Convert its times to the joined clock (rule 1)."""
+        tables = self.found.tables
+        if self.shift:
+            self.seen_at = self.seen_at + self.shift
+            for name, columns in _TIMES.items():
+                for column in columns:
+                    times = tables[name][column]
+                    times[times > 0] += self.shift
+            run = self.found.run
+            if run.notices_stops is not None:
+                self.found.run = replace(run, notices_stops=run.notices_stops + self.shift)
         self.last = max(self.first, int(self.seen_at.max(initial=0)), *(
             int(tables[name][column].max(initial=0))
             for name, column in _HAPPENED.items()))
@@ -242,19 +236,11 @@ class Joined:
                 raise ReplayError(
                     part.name, f'it was recorded with another declaration than {first.name}',
                     'give the traces of one run')
-        self._machines = clocks.machines([(part.boot, part.clock) for part in self._parts])
-        self._set_clocks(self._given(offsets))
-        # by DAG: releases with their job numbers, and the parts that have released the job
-        self._releases: list[deque[tuple[int, int, set[int]]]] = [
-            deque(maxlen=_KEPT) for _ in self.task_set.dags]
-        self._next = [0] * len(self.task_set.dags)
-        #: By vertex the number of its legs and its DAG, and by DAG its vertices.
+        self._offsets = offsets
+        #: By vertex the number of its legs, and its DAG.
         self._legs = Numbering(self.task_set).n_legs
         self._dag_of = np.array([
             *(dag.index for dag in self.task_set.dags for _ in dag.vertices), UNKNOWN])
-        first_of = np.cumsum([0, *(len(dag.vertices) for dag in self.task_set.dags)]).tolist()
-        self._vertices = [range(*each) for each in zip(first_of, first_of[1:])]
-        self._hosted: list[tuple[int, int, int, frozenset[int]]] = []
 
     def _given(self, offsets: Mapping[str, int]) -> dict[int, int]:
         """Return the given offsets, by machine."""
@@ -275,11 +261,14 @@ class Joined:
             found[machine] = ahead
         return found
 
-    def _set_clocks(self, given: Mapping[int, int]) -> None:
+    def _set_clocks(self) -> None:
         """Convert all traces to the first trace's clock (rule 1)."""
+        stated = [part.found.stated for part in self._parts]
+        self._machines = clocks.machines([(each.boot, each.clock) for each in stated])
+        given = self._given(self._offsets)
         several = set(self._machines) - {0}
         for part, machine in zip(self._parts, self._machines):
-            part.shift = self._parts[machine].clock - part.clock
+            part.shift = stated[machine].clock - part.found.stated.clock
         ways: clocks.Ways = {}
         if several - given.keys():
             ways = clocks.ways(
@@ -306,9 +295,12 @@ class Joined:
         """
         who, threads, count = Entities(by_address=True), Numbers(), 0
         for part in self._parts:
-            part.read(who, threads, self._workers, count, progress)
+            part.read(self.task_set, who, threads, self._workers, count, progress)
             count += part.reader.message_count or 0
-        self._number_jobs()
+        self._set_clocks()
+        for part in self._parts:
+            part.move()
+        hosted = self._number_jobs()
         rows = [part.renumber(self._legs, self._dag_of) for part in self._parts]
         self._check_run()
         head = self.head._replace(
@@ -320,7 +312,7 @@ class Joined:
             processes=len(self._parts), placed=self._placed(),
             workers_each=max(part.head.workers for part in self._parts),
             hosted=[(int(ranks[place][order]), dag, vertices)
-                    for place, order, dag, vertices in self._hosted]), tables['executions'])
+                    for place, order, dag, vertices in hosted]), tables['executions'])
         run = replace(run, start=begin_of(tables['releases'], tables['executions']))
         lost = sum(part.found.lost for part in self._parts)
         return Recording(
@@ -378,12 +370,13 @@ class Joined:
         """Return the run with the times at which judging begins and ends (rules 4 and 5)."""
         labels = {part.label for part in self._parts}
         # without restarted processes, and those that have never judged
-        judging = [part.judges_from + part.shift for part in self._parts
-                   if 0 < part.judges_from < NEVER
+        judging = [part.found.stated.judges_from + part.shift for part in self._parts
+                   if 0 < part.found.stated.judges_from < NEVER
                    and part.label.partition('.')[0] not in labels - {part.label}]
         if judging:
             run = replace(run, judge_from=max(judging))
-        ends = [part.end + part.shift for part in self._parts if part.end is not None]
+        ends = [part.found.stated.end + part.shift for part in self._parts
+                if part.found.stated.end is not None]
         end = max(int(part.seen_at.max(initial=0)) for part in self._parts)
         run = replace(run, end=min(end, NEVER - 1), judged_until=min(end, NEVER - 1))
         if ends:
@@ -398,81 +391,18 @@ class Joined:
 
     # --- jobs ------------------------------------------------------------------------------------
 
-    def _number_jobs(self) -> None:
-        """Assign numbers to jobs (rule 3), and note the expected vertices (rule 4)."""
-        events: list[tuple[int, int, int, int, Any]] = []
-        for part in self._parts:
-            releases, seen_at = part.found.tables['releases'], part.seen_at
-            events += [
-                (int(seen_at[order]), part.place, order, row, None)
-                for row, order in enumerate(releases['order'].tolist())]
-            events += [(int(seen_at[order]), part.place, order, dag, vertices)
-                       for order, dag, vertices in part.found.run.hosted]
-        columns = [
-            [part.found.tables['releases'][name].tolist()
-             for name in ('dag', 'release', 'noticed')] for part in self._parts]
-        for part in self._parts:
-            part.number = np.full(len(part.found.tables['releases']), UNKNOWN)
-            part.is_first = np.zeros(len(part.number), dtype=np.bool_)
-            part.expected = np.zeros(len(part.number), dtype=np.int64)
-        events.sort(key=lambda event: event[:3])
-        legs_here: list[dict[int, int]] = [{} for _ in self._parts]
-        for _, place, order, which, vertices in events:
-            part = self._parts[place]
-            if vertices is not None:
-                part.hosted[which] = vertices
-                legs_here[place].pop(which, None)
-                every = frozenset().union(
-                    *(each.hosted.get(which, ()) for each in self._parts))
-                self._hosted.append((place, order, which, every))
-                continue
-            dag, release, noticed = (column[which] for column in columns[place])
-            if release < noticed:   # otherwise the release is a stamp in the future
-                release = self._by_source(self.task_set.dags[dag], release, part)
-            known = self._find(self.task_set.dags[dag], release, place)
-            if known is None:
-                number = self._next[dag]
-                self._next[dag] += 1
-                self._releases[dag].append((release, number, {place}))
-                part.found.tables['releases']['release'][which] = release
-                part.is_first[which] = True
-            else:
-                number = known[1]
-                known[2].add(place)
-            part.number[which] = number
-            if dag not in legs_here[place]:
-                legs_here[place][dag] = int(sum(
-                    self._legs[v] for v in part.hosted.get(dag, self._vertices[dag])))
-            part.expected[which] = legs_here[place][dag]
-
-    def _by_source(self, dag: Dag, release: int, part: _Part) -> int:
-        """Return a release on the joined clock; a stamp counts by the source machine's clock."""
-        if dag.release_from != 'header_stamp' or self._vertices[
-                dag.index][dag.source] in part.hosted.get(dag.index, self._vertices[dag.index]):
-            return release
-        machine, found = next(
-            ((m, p) for m, p in zip(self._machines, self._parts)
-             if self._vertices[dag.index][dag.source] in p.hosted.get(dag.index, ())), (0, part))
-        if machine == self._machines[part.place]:
-            return release
-        return release - part.shift + found.shift
-
-    def _find(self, dag: Dag, release: int, place: int) -> tuple[int, int, set[int]] | None:
-        """Return the job of a release that another process has released (rule 3)."""
-        stamped = dag.release_from == 'header_stamp'
-        nearest = earlier = None
-        least = SAME_RELEASE
-        for known in reversed(self._releases[dag.index]):
-            away = release - known[0]
-            if away > max(dag.period_ns, SAME_RELEASE):
-                break
-            if place in known[2]:
-                continue
-            if abs(away) <= least:
-                nearest, least = known, abs(away)
-            elif stamped and earlier is None and 0 < away < dag.period_ns:
-                earlier = known
-        return earlier if nearest is None else nearest
+    def _number_jobs(self) -> list[tuple[int, int, int, frozenset[int]]]:
+        """Assign numbers to jobs; return by change the vertices of all processes (``Hosted``)."""
+        jobs = JoinedJobs(self.task_set, [
+            Released(part.found.tables['releases'], part.seen_at, part.found.run.hosted, machine,
+                     part.shift)
+            for part, machine in zip(self._parts, self._machines)], self._legs)
+        for part, numbered in zip(self._parts, jobs.numbered):
+            part.number, part.is_first, part.expected = (
+                numbered.number, numbered.is_first, numbered.expected)
+            part.found.tables['releases']['release'] = np.where(
+                part.is_first, numbered.release, part.found.tables['releases']['release'])
+        return jobs.hosted
 
     def _check_run(self) -> None:
         """Refuse traces of several runs (rule 6)."""
@@ -510,7 +440,7 @@ class Joined:
         """Yield missing data of each trace, and jobs that ended with its process (rule 5)."""
         for part in self._parts:
             yield from part.found.losses
-            if part.end is not None:
+            if part.found.stated.end is not None:
                 continue
             jobs = [f'{self.task_set.dags[dag].name} {number}' for dag, number in part.open_jobs]
             yield Loss('end', 1, (

@@ -69,7 +69,6 @@ from mddag_executor.sources.imported_events import (
     LOST,
     RCL,
     RCLCPP,
-    READY,
     RMW_PUBLISH,
     START,
     TAKE,
@@ -82,7 +81,7 @@ _DEEPEST = 32
 _NONE, _SEVERAL = -1, -2      # instead of a publication
 _PUBLISHES = (INTRA, RCLCPP, RCL)
 _STAMPS = (DDS_WRITE, BIND, RMW_PUBLISH)
-_ARRIVALS = (DISPATCH, TAKE, WITHIN, DEQUEUE, READY)
+_ARRIVALS = (DISPATCH, TAKE, WITHIN, DEQUEUE)
 
 _SAID = {
     'ends': ('execution', 'without an end in it (the event was lost)'),
@@ -180,7 +179,7 @@ class Links:
         # by thread, then by time
         self._order = sort_by(self.events['thread'])
         self.callbacks, self._callback = self._objects(
-            np.isin(kind, (START, END, DISPATCH, WITHIN, READY)),
+            np.isin(kind, (START, END, DISPATCH, WITHIN)),
             who.callbacks, who.callback)
         self.publishers, self._publisher = self._objects(
             np.isin(kind, _PUBLISHES) & (self.events['a'] != 0), who.publishers)
@@ -210,10 +209,10 @@ class Links:
         find = find or known.latest
         at = np.flatnonzero(events)
         table = self.events
-        pid, address = self._pid[table['thread'][at]], table['a'][at]
-        processes, addresses = distinct(pid), distinct(address)
-        key = np.searchsorted(processes, pid) * max(1, len(addresses)) + np.searchsorted(
-            addresses, address)
+        address = table['a'][at]
+        _, process = different(self._pid)
+        addresses, key = different(address)
+        key = key + process[table['thread'][at]] * max(1, len(addresses))
         order = sort_by(key)
         begins = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0][:len(order)])
         groups = sorted(np.split(order, begins[1:]), key=lambda each: each[:1].tolist())
@@ -221,7 +220,8 @@ class Links:
         found: list[Any] = []
         index = np.full(len(table), -1)
         for group in groups if len(order) else ():
-            where = int(pid[group[0]]), int(address[group[0]]) % ADDRESSES
+            where = (int(self._pid[table['thread'][at[group[0]]]]),
+                     int(address[group[0]]) % ADDRESSES)
             times = table['time'][at[group]]
             since = np.array(known.times(*where), dtype=np.int64)
             piece = np.maximum(0, as_of(since, times))
@@ -241,9 +241,10 @@ class Links:
 
         The result is in the order of the events.
         """
-        order = self._order
+        asked = (of | before)[self._order]
+        order = self._order[asked]
         latest = last_of(of[order], self.events['thread'][order], before=True)
-        found = np.full(len(order), -1)
+        found = np.full(len(asked), -1)
         found[order] = np.where(latest >= 0, order[latest], -1)
         return found[before]
 
@@ -349,36 +350,40 @@ class Links:
 
     def _publications(self) -> Table:
         """Return the publications (rule 2), without their source timestamps."""
-        table = self.events
-        kind, handle, publisher = table['kind'], table['a'], self._publisher
-        publishes = np.isin(kind, _PUBLISHES)
-        previous = np.full(len(table), -1)
-        previous[publishes] = self._last(publishes | (kind <= END), publishes)
-        before = np.maximum(previous, 0)
-        after_intra = (kind == RCLCPP) & (previous >= 0) & (kind[before] == INTRA) & (
-            (handle == 0) | (publisher == publisher[before]))
-        # by event: the publisher so far
-        so_far = np.where(after_intra, publisher[before], publisher)
-        after_rclcpp = (kind == RCL) & (previous >= 0) & (kind[before] == RCLCPP) & (
-            (so_far[before] < 0) | (so_far[before] == publisher))
-        joins = after_intra | after_rclcpp
-        at = np.flatnonzero(publishes & ~joins)
+        table, kinds = self.events, self.events['kind']
+        publishes = np.isin(kinds, _PUBLISHES)
+        at = np.flatnonzero(publishes)
+        kind, handle, message = (table[name][at] for name in ('kind', 'a', 'b'))
+        publisher = self._publisher[at]
         #: By event of a publication: its row, or -1.
         self._row = np.full(len(table), -1)
         self._row[at] = np.arange(len(at))
+        previous = self._last(publishes | (kinds <= END), publishes)
+        before = np.where(previous >= 0, self._row[previous], -1)   # -1: a start or end
+        after = np.maximum(before, 0)
+        after_intra = (kind == RCLCPP) & (before >= 0) & (kind[after] == INTRA) & (
+            (handle == 0) | (publisher == publisher[after]))
+        # the publisher so far
+        so_far = np.where(after_intra, publisher[after], publisher)
+        after_rclcpp = (kind == RCL) & (before >= 0) & (kind[after] == RCLCPP) & (
+            (so_far[after] < 0) | (so_far[after] == publisher))
+        begins = ~(after_intra | after_rclcpp)
+        row = np.cumsum(begins) - 1
         for again in (after_intra, after_rclcpp):
-            self._row[again] = self._row[before[again]]
-        found = rows(_MESSAGE, len(at))
-        found['at'], found['publisher'], found['time'] = at, so_far[at], table['time'][at]
-        found['message'], found['within'] = table['b'][at], kind[at] == INTRA
-        rclcpp = np.flatnonzero(kind == RCLCPP)
-        found['header'][self._row[rclcpp]] = table['c'][rclcpp]
-        found['run'] = self._running(publishes)[~joins[publishes]]
-        found['within'][self._row[after_intra]] = False
+            row[again] = row[after[again]]
+        self._row[at] = row
+        found = rows(_MESSAGE, int(begins.sum()))
+        found['at'], found['publisher'], found['message'] = (
+            each[begins] for each in (at, so_far, message))
+        found['time'], found['within'] = table['time'][found['at']], kind[begins] == INTRA
+        rclcpp = kind == RCLCPP
+        found['header'][row[rclcpp]] = table['c'][at[rclcpp]]
+        found['run'] = self._running(publishes)[begins]
+        found['within'][row[after_intra]] = False
         for again in (after_intra, after_rclcpp):
-            found['message'][self._row[again]] = table['b'][again]
-        found['publisher'][self._row[after_rclcpp]] = publisher[after_rclcpp]
-        self._count_partial(found[kind[at] == RCL]['publisher'], publisher[after_rclcpp])
+            found['message'][row[again]] = message[again]
+        found['publisher'][row[after_rclcpp]] = publisher[after_rclcpp]
+        self._count_partial(found['publisher'][kind[begins] == RCL], publisher[after_rclcpp])
         return found
 
     def _count_partial(self, only_rcl: Ints, by_both: Ints) -> None:
@@ -422,9 +427,11 @@ class Links:
     def _find(self, topic: Ints, stamp: Ints) -> Ints:
         """Return the publications of source timestamps; ``_NONE`` or ``_SEVERAL`` without one."""
         which, count = equal_pairs(self._pairs, (topic, stamp))
-        unnamed, unnamed_count = equal_pairs(self._pairs, (np.zeros_like(topic), stamp))
-        which = np.where((count != 1) & (unnamed_count == 1), unnamed, which)
-        return np.where((count > 1) & (unnamed_count != 1), _SEVERAL, self._stamped[which])
+        found: Ints = np.where(count > 1, _SEVERAL, self._stamped[which])
+        rest = np.flatnonzero(count != 1)
+        unnamed, count = equal_pairs(self._pairs, (np.zeros_like(rest), stamp[rest]))
+        found[rest[count == 1]] = self._stamped[unnamed[count == 1]]
+        return found
 
     # --- messages that arrive --------------------------------------------------------------------
 

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER
 from mddag_executor.memory import give_back
@@ -70,10 +70,12 @@ from mddag_executor.sources.head import (
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.events import Batch, Event
-from mddag_executor.trace.schema import EVENTS, PREAMBLE
+from mddag_executor.trace.schema import EVENTS, HOST, PREAMBLE
+from msg_graph import TaskSet
 import numpy as np
 
-_PUBLISH, _RELEASE = 'ros2:rclcpp_publish', 'mddag:job_release'
+_INIT, _PUBLISH, _RELEASE = (
+    'ros2_caret:caret_init', 'ros2:rclcpp_publish', 'mddag:job_release')
 (_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
  _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP) = (
     f'mddag:{name}' for name in (
@@ -114,7 +116,7 @@ def read_own(
     """
     with named_errors(reader.path, name):
         who = Entities(by_address=True)
-        read = _Source(reader, name, head, who).read(progress)
+        read = _Source(reader, name, head, declared(head, name), who).read(progress)
     executions = read.tables['executions']
     if not executions['piece'].any():
         executions.replace('began', executions['start'])
@@ -128,16 +130,17 @@ def read_own(
 
 
 def read_process(
-    reader: TraceReader, name: str, head: Head, who: Entities, edit: Callable[[Event], Event],
-    progress: Progress | None = None,
+    reader: TraceReader, name: str, head: Head, task_set: TaskSet, who: Entities,
+    edit: Callable[[Event], Event], progress: Progress | None = None,
 ) -> Read:
     """
     Return what was read of one of several processes.
 
+    :param task_set: the declaration in its head.
     :param who: receives the nodes and callbacks; ``edit``: changes initialisation events.
     """
     with named_errors(reader.path, name):
-        return _Source(reader, name, head, who, edit).read(progress)
+        return _Source(reader, name, head, task_set, who, edit).read(progress)
 
 
 def begin_of(releases: Table, executions: Table) -> int | None:
@@ -158,6 +161,21 @@ def end_losses(run: Run, n_releases: int, lost: int) -> Iterator[Loss]:
         yield no_jobs(run.name)
 
 
+class Stated(NamedTuple):
+    """
+    What a process says about itself; of several events the last one in the file.
+
+    :ivar clock: offset from the machine's steady clock to its times, ns; ``boot``: the boot of the
+        machine, '': unknown.
+    :ivar judges_from: from when it judged, 0: unknown; ``end``: until when, None: not recorded.
+    """
+
+    clock: int = 0
+    boot: str = ''
+    judges_from: int = 0
+    end: int | None = None
+
+
 @dataclass
 class Read:
     """
@@ -166,6 +184,7 @@ class Read:
     :ivar tables: by name, see ``tables.TABLES``.
     :ivar lost: number of events that the recorder lost.
     :ivar seen_at: the times of the core's events, by position in the order.
+    :ivar stated: what the process says about itself.
     """
 
     run: Run
@@ -175,17 +194,18 @@ class Read:
     lost: int
     losses: Sequence[Loss]
     seen_at: Ints
+    stated: Stated
 
 
 class _Source:
     """Reads one trace."""
 
     def __init__(
-        self, reader: TraceReader, name: str, head: Head, who: Entities,
+        self, reader: TraceReader, name: str, head: Head, task_set: TaskSet, who: Entities,
         edit: Callable[[Event], Event] | None = None,
     ) -> None:
         self._reader, self._name, self._head, self._edit = reader, name, head, edit
-        self._task_set = declared(head, name)
+        self._task_set = task_set
         self._numbering = Numbering(self._task_set)
         self._strange: Counter[str] = Counter()
         self._executions = ExecutionJoin(_ROWS[COMPLETE], self._numbering, self._strange)
@@ -198,7 +218,7 @@ class _Source:
     def read(self, progress: Progress | None) -> Read:
         count = 0
         for batch in self._reader.batches({
-                *_ROWS, *OWN_INIT_EVENTS, TASK_SET, _DROP, _HOSTED, _UNFINISHED}):
+                *_ROWS, *OWN_INIT_EVENTS, _INIT, HOST, TASK_SET, _DROP, _HOSTED, _UNFINISHED}):
             self._take(batch)
             count += batch.n_events
             if progress is not None:
@@ -243,6 +263,7 @@ class _Source:
 
     def _read(self) -> Read:
         self._entities()
+        stated = self._stated()
         unfinished, places = self._unfinished()
         executions, completed = self._executions.tables()
         self._last_seen = max(self._last_seen, self._executions.last)
@@ -271,7 +292,16 @@ class _Source:
             'releases': releases, 'executions': executions, 'publications': publications,
             'job_ends': job_ends, 'misses': misses, 'demotions': demotions, 'losses': losses,
             'stops': stops, 'drops': drops, 'takes': rows(TAKES), 'unfinished': unfinished},
-            reasons, places, lost, self._doubts(), times[in_order])
+            reasons, places, lost, self._doubts(), times[in_order], stated)
+
+    def _stated(self) -> Stated:
+        """Return what the process says about itself."""
+        last = {event[0]: event[4:] for _, event in self._others if event[0] in (_INIT, HOST)}
+        until, begin = (self._kinds[kind].rows()[field][-1:].tolist() for kind, field in (
+            (_SHUTDOWN, 'end'), (_JUDGE_FROM, 'release')))
+        return Stated(
+            *last.get(_INIT, (0,))[:1], *last.get(HOST, ('', ''))[1:2], *(begin or (0,)),
+            *until)
 
     def _entities(self) -> None:
         self._others.sort(key=lambda each: each[0])

@@ -35,7 +35,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
-from mddag_executor.recording.joins import as_of, distinct, equal_pairs, rows_by, sort_by
+from mddag_executor.recording.joins import as_of, distinct, rows_by, sort_by
 from mddag_executor.recording.losses import Loss
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, UNKNOWN
@@ -45,9 +45,7 @@ from mddag_executor.sources.head import no_end, steps
 from mddag_executor.sources.imported_events import (
     END,
     Events,
-    KINDS,
     OWN_KINDS,
-    READY,
     SHUTDOWN,
     START,
     TAKE,
@@ -108,42 +106,36 @@ class _OwnLinks(Links):
     def _arrivals(self) -> Ints:
         """Find the taken message of each execution (rule 1)."""
         table = self.events
-        kind, time = table['kind'], table['time']
-        takes, ready = kind == TAKE, kind == READY
-        #: By event of a dispatch the event of the taken message, or -1.
-        self._taken_at = np.full(len(table), -1)
-        taken, dispatched = np.flatnonzero(takes), np.flatnonzero(ready)
+        runs, time = self.runs, table['time']
+        began, start = runs['at'], runs['start']
+        ready, due = table['b'][began], table['c'][began]
+        taken_at = np.full(len(runs), -1)
+        taken = np.flatnonzero(table['kind'] == TAKE)
         takes_by = rows_by(self._subscription[taken], len(self.taken))
-        ready_by = rows_by(self._callback[dispatched], len(self.callbacks))
+        runs_by = rows_by(runs['callback'], len(self.callbacks))
         subscriptions: dict[int, list[int]] = {}
         for number, callbacks in enumerate(self.taken):
             for one in {id(callback) for callback in callbacks}:
                 subscriptions.setdefault(one, []).append(number)
-        for callback, those in zip(self.callbacks, ready_by):
+        for callback, these in zip(self.callbacks, runs_by):
             mine = np.sort(np.concatenate([taken[:0], *(
                 taken[takes_by[each]] for each in subscriptions.get(id(callback), ()))]))
-            these = dispatched[those] if len(mine) else mine
-            place = as_of(time[mine], table['b'][these])
+            these = these if len(mine) else mine
+            place = as_of(time[mine], ready[these])
             these, place = these[place >= 0], place[place >= 0]
             # a message starts one execution; its pieces have the same ready time
             _, first, which = np.unique(place, return_index=True, return_inverse=True)
-            same = table['b'][these] == table['b'][these[first[which]]]
-            self._taken_at[these[same]] = mine[place[same]]
-        starts = kind == START
-        last = self._last(ready | starts, starts)
-        known = (last >= 0) & ready[last]
-        start = self.runs['start']
-        self.runs['ready'] = np.where(known, np.clip(table['b'][last], 0, start), start)
-        due = np.where(known, table['c'][last], 0)
-        self.runs['due'] = np.where((due > 0) & (due <= self.runs['ready']), due, 0)
-        found: Ints = np.where(known, self._taken_at[last], -1)
-        return found
+            same = ready[these] == ready[these[first[which]]]
+            taken_at[these[same]] = mine[place[same]]
+        runs['ready'] = np.clip(ready, 0, start)
+        runs['due'] = np.where((due > 0) & (due <= runs['ready']), due, 0)
+        return taken_at
 
 
 class UndeclaredRun(ImportedRun):
     """A run of this executor that was recorded without a declaration."""
 
-    kinds = {**KINDS, **OWN_KINDS}
+    kinds = OWN_KINDS
     others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP)
     links_type = _OwnLinks
     odd = {**OFF_THE_GRID, 'off': (
@@ -154,27 +146,33 @@ class UndeclaredRun(ImportedRun):
 
     def _with_unfinished(self, events: Events) -> Events:
         """Add the starts of executions that have not ended (rule 5)."""
-        starts, ready = (events.table[events.table['kind'] == kind] for kind in (START, READY))
-        begun = set(starts[['thread', 'a', 'time']].tolist())
-        resumed = {(callback, ready): time for time, callback, ready in ready[
-            ['time', 'a', 'b']].tolist()}   # by callback and ready time the last dispatch
-        threads = {each: number for number, each in enumerate(events.threads)}
         found: dict[tuple[int, int, int], tuple[int, int, str]] = {}
-        for event in events.others:
-            layout, _, pid, tid, *values = event
-            fields = dict(zip(layout.fields, values))
-            if layout.name == _UNFINISHED and 0 < fields.get('start', 0) < NEVER:
-                thread = threads.setdefault((pid, tid), len(threads))
-                key = thread, signed(fields.get('callback', 0)), fields['start']
-                if key not in begun and (tid or resumed.get(
-                        (key[1], fields.get('ready', 0)), 0) < fields['start']):
-                    found[key] = (fields.get('ready', 0), fields.get('worker', UNKNOWN),
-                                  str(fields.get('where', '')))
         #: By thread, address and start of an unfinished execution: ready, worker, where it was.
         self._found = found
-        table = concatenate([events.table, *(
-            rows(events.table.dtype, 2, time=start, place=0, thread=thread, kind=(READY, START),
-                 a=callback, b=(ready, 0))
+        several = []
+        for layout, _, pid, tid, *values in events.others:
+            fields = dict(zip(layout.fields, values))
+            if layout.name == _UNFINISHED and 0 < fields.get('start', 0) < NEVER:
+                several.append((pid, tid, fields))
+        if not several:
+            return events
+        table = events.table
+        addresses = np.array([signed(fields.get('callback', 0)) for _, _, fields in several])
+        starts = table[(table['kind'] == START) & np.isin(table['a'], addresses)]
+        begun = set(starts[['thread', 'a', 'time']].tolist())
+        resumed = {(callback, ready): time for time, callback, ready in starts[
+            ['time', 'a', 'b']].tolist()}   # by callback and ready time the last dispatch
+        threads = {each: number for number, each in enumerate(events.threads)}
+        for (pid, tid, fields), address in zip(several, addresses.tolist()):
+            thread = threads.setdefault((pid, tid), len(threads))
+            key = thread, address, fields['start']
+            if key not in begun and (tid or resumed.get(
+                    (address, fields.get('ready', 0)), 0) < fields['start']):
+                found[key] = (fields.get('ready', 0), fields.get('worker', UNKNOWN),
+                              str(fields.get('where', '')))
+        table = concatenate([table, *(
+            rows(table.dtype, 1, time=start, place=0, thread=thread, kind=START, a=callback,
+                 b=ready)
             for (thread, callback, start), (ready, *_) in found.items())])
         return events._replace(
             table=table[sort_by(table['time'], table['place'])], threads=[*threads])
@@ -267,8 +265,11 @@ class UndeclaredRun(ImportedRun):
     def _pieces(self) -> tuple[Ints, Mask]:
         """Return the first pieces of executions, and which end them (rule 4)."""
         runs = self.links.runs
-        pairs = runs['callback'], runs['ready']
-        first, _ = equal_pairs(pairs, pairs)
+        first = np.arange(len(runs))
+        order = sort_by(runs['callback'], runs['ready'])
+        number, ready = runs['callback'][order], runs['ready'][order]
+        again = np.append(False, (np.diff(number) == 0) & (np.diff(ready) == 0))[:len(runs)]
+        first[order] = order[np.maximum.accumulate(np.where(again, 0, first))]
         newest, lost = np.full(len(runs), UNKNOWN), np.zeros(len(runs), dtype=np.bool_)
         np.maximum.at(newest, first, runs['end_at'])
         lost[first[runs['end_at'] < 0]] = True
