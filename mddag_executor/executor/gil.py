@@ -74,11 +74,12 @@ SELDOM = 32
 
 CHECK_NS = 2_000_000
 LAST_CHECK_NS = 10 * CHECK_NS
-CHECK_PART = 2
+CHECK_PART = 4
 """
 The interval between checks grows from the first to the last; short callbacks use the last.
 
-The first is shorter if what waits is urgent: this part of ``Engine.patience``.
+The first is shorter if what waits is urgent: this part of ``Interpreter.patience``.  With half of
+it, the successor of a callback that waits after its publication started 0.1 ms later.
 """
 
 SWITCH_INTERVAL_S = 0.001
