@@ -108,8 +108,10 @@ class GuestExecutor:
     _errors: deque[BaseException]
     has_spun = is_pool = False
     _is_stopped = False
-    # pieces of callbacks that have ended, and how many had at the end of the last spin
-    _n_ended = _n_seen = 0
+    # Pieces of callbacks that have ended, and those among them that were in no group.  They are
+    # counted because several threads may step at once, and each must see the same end.
+    _n_ended = _n_free_ended = 0
+    _seen: threading.local  # ``n_free_ended`` when the last spin of this thread ended
     _n_stepping = _n_spinning = 0
 
     @property
@@ -167,14 +169,14 @@ class GuestExecutor:
         """Let the nodes run until a callback has run, or a condition is true; see ``_let_run``."""
         with self._lock:
             self._n_stepping += 1
-        # callbacks that are in no group also run between two spins
         groups = self._groups()
-        seen = self._n_ended if groups else self._n_seen
-
+        seen = self._n_ended
+        # callbacks that are in no group also run between two spins: this step is what they end
+        seen_free = getattr(self._seen, 'n_free_ended', 0)
         own = outer_here()
 
         def has_ended() -> bool:  # a callback that runs in a spin of another one is none of ours
-            return self._n_ended > seen and all(
+            return (self._n_ended > seen or self._n_free_ended > seen_free) and all(
                 group.n_nested <= (group.number == own) for group in groups)
 
         try:
@@ -218,7 +220,7 @@ class GuestExecutor:
                 self._n_spinning -= 1
             if not self._n_spinning:
                 self._close(groups, is_interrupted)
-            self._n_seen = self._n_ended
+            self._seen.n_free_ended = self._n_free_ended
         return raised[0] if raised else None
 
     def _groups(self) -> list[Any]:
@@ -276,10 +278,11 @@ class GuestExecutor:
         """Let waiting threads check their conditions again."""
         self._changed.notify()
 
-    def callback_ended(self, error: BaseException | None) -> bool:
+    def callback_ended(self, error: BaseException | None, outer: int) -> bool:
         """Note that a callback has ended; return whether a spin raises its error."""
         if error is None:
             self._n_ended += 1
+            self._n_free_ended += outer < 0
             if self._n_stepping:
                 self.wake_waiting()
             return False
@@ -348,6 +351,7 @@ def make_guest(executor: Any, host: HostOfExecutors, guest: Guest | None) -> Non
     executor.__class__ = _guest_class(executor.__class__)
     executor.host, executor.guest = host, guest
     executor._changed, executor._lock, executor._errors = Change(), threading.Lock(), deque()
+    executor._seen = threading.local()
 
 
 def _is_replaced(kind: type[Executor], name: str) -> bool:

@@ -493,7 +493,7 @@ class Host:
         """Note the end of a callback; return whether a spin of its program raises its error."""
         executor = self._executor_of_group.get(outer)
         if executor is not None:
-            return bool(executor.callback_ended(error))
+            return bool(executor.callback_ended(error, outer))
         if entity is None:
             return False
         if entity not in self._node_of:
@@ -503,7 +503,7 @@ class Host:
                 for some in lists for each in some})
         node = self._node_of.get(entity, lambda: None)()
         executor = None if node is None else node.executor
-        return isinstance(executor, GuestExecutor) and executor.callback_ended(error)
+        return isinstance(executor, GuestExecutor) and executor.callback_ended(error, outer)
 
     # --- waiting ---------------------------------------------------------------------------------
 

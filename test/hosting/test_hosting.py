@@ -314,6 +314,13 @@ nodes:
         assert waited is None or float(waited[1]) < 0.2, done.stdout
 
 
+def test_a_step_ends_with_what_a_concurrent_callback_did_before_it(world, mddag, monkeypatch):
+    monkeypatch.setenv('PYTHONPATH', str(GUESTS), prepend=os.pathsep)
+    for arguments in ([], ['--concurrent', 'waits']):
+        done = mddag('run', '-q', '--node', 'overlap:waits_between_steps', *arguments)
+        assert (done.returncode, done.stdout, done.stderr) == (0, 'waits: 1 has run\n', '')
+
+
 def test_a_context_of_a_programs_own_is_left_alone(world, mddag):
     done = mddag('run', '--node', 'chat:has_another_context')
     assert done.returncode == 0 and 'Traceback' not in done.stderr, done.stderr

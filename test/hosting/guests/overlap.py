@@ -93,6 +93,25 @@ def steps():
     robot.run(SingleThreadedExecutor(), robot.steps)
 
 
+def waits_between_steps():
+    """Step for what a callback does; a concurrent one runs before the step."""
+    rclpy.init()
+    node, done = Node('waits'), []
+
+    def once():
+        timer.cancel()
+        done.append(1)
+
+    timer = node.create_timer(0.1, once)
+    timer.cancel()
+    rclpy.spin_once(node, timeout_sec=0.001)
+    timer.reset()
+    time.sleep(0.3)
+    rclpy.spin_once(node)
+    print(f'waits: {len(done)} has run', flush=True)
+    rclpy.shutdown()
+
+
 def has_threads():
     """Let three of twelve timers run at a time, as many as the executor has threads."""
     rclpy.init()
