@@ -187,12 +187,13 @@ def test_a_signal_ends_a_run_also_if_it_comes_twice(graph, number):
 def test_a_stop_of_the_machine_is_told_from_the_executors_own_misses(graph):
     with started(graph) as process:
         wait_for_run(process, lambda: bool(releases()))
-        process.send_signal(signal.SIGSTOP)
-        time.sleep(0.3)
-        process.send_signal(signal.SIGCONT)
-        # It ends when what was due meanwhile has been taken in.
-        after = time.time_ns()
-        wait_for_run(process, lambda: releases()[-1] > after)
+        for _ in range(3):  # on a busy machine it may come when no thread waits: it proves nothing
+            process.send_signal(signal.SIGSTOP)
+            time.sleep(0.3)
+            process.send_signal(signal.SIGCONT)
+            # It ends when what was due meanwhile has been taken in.
+            after = time.time_ns()
+            wait_for_run(process, lambda after=after: releases()[-1] > after)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert process.returncode == 0, err

@@ -395,6 +395,9 @@ def make():
 
 function = globals()[sys.argv[3]]  # a program has arguments of its own
 run_threads._COMPUTES = 2
+rclpy.init()
+rclpy.create_node('first').destroy_node()  # Kilted imports a lot for it, which would count
+rclpy.shutdown()
 try:
     rerun(*sys.argv[1:3], [make], patience_s=0.5)
 except RerunError as error:
