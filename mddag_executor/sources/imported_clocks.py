@@ -6,9 +6,12 @@ The clocks of the computers of an imported recording.
 Theory of operation
 -------------------
 A recording of LTTng says which processes ran on one computer (`mddag:host`), others do not.
+Containers have names of their own, and the clock of their computer: what counts is its boot.
 
 1. On one clock no message is received before it was published.  If none is, all processes are
-   assumed to have one clock, and times are left as they are.
+   assumed to have one clock, and times are left as they are.  Between known computers, a warning
+   says so, and by how much their clocks can differ: by less than the shortest message in the
+   direction in which a difference makes messages shorter.
 2. Otherwise processes are grouped into machines: those of one computer first, then those with the
    shortest messages, so that no message within a machine is received before it was published.
 3. The offsets of the machines from the one with the most executions are estimated from messages in
@@ -34,11 +37,11 @@ class ImportedClocks:
     """
     The clocks of the processes of a recording.
 
-    :param hosts: by process id its computer, if it is known.
+    :param hosts: by process id its computer, if it is known: its name, and that of its boot.
     :ivar shift: by process id what is added to its times, ns; without those that do not change.
     """
 
-    def __init__(self, links: Links, hosts: Mapping[int, str]) -> None:
+    def __init__(self, links: Links, hosts: Mapping[int, tuple[str, str]]) -> None:
         self._links = links
         runs, messages = links.runs, links.messages
         pids, which = different(np.array([pid for pid, _ in links.threads], dtype=np.int64))
@@ -51,10 +54,14 @@ class ImportedClocks:
         self._between = (runs['message'] >= 0) & (self._sends != self._receives)
         self._ways = self._least(self._sends, self._receives)
         self.shift: dict[int, int] = {}
-        self._machine = list(range(len(self._pids)))
+        self._machine = [0] * len(self._pids)
         self._offsets: dict[int, clocks.Offset] = {}
-        if any(least < 0 for least in self._ways.values()):
-            self._find_machines(hosts)
+        self._clock = {pid: boot or name for pid, (name, boot) in hosts.items()}
+        self._host = {self._clock[pid]: name for pid, (name, _) in hosts.items()}
+        least = self._ways
+        if any(each < 0 for each in least.values()):
+            self._find_machines()
+        self._assumed = self._of_computers(least)
 
     def _least(self, sends: Ints, receives: Ints) -> clocks.Ways:
         """Return the minimum time of messages from one process or machine to another."""
@@ -67,9 +74,25 @@ class ImportedClocks:
             found[pair >> 32, pair & 0xFFFFFFFF] = latency
         return found
 
-    def _find_machines(self, hosts: Mapping[int, str]) -> None:
+    def _of_computers(self, ways: clocks.Ways) -> dict[tuple[str, str], int]:
+        """
+        Return the minimum time of messages from one known computer to another (rule 1).
+
+        :param ways: of messages from process to process.
+        :return: of computers whose clocks are assumed to be one.
+        """
+        found: dict[tuple[str, str], int] = {}
+        for (a, b), least in ways.items():
+            of, to = (self._clock.get(self._pids[each]) for each in (a, b))
+            if of is not None and to is not None and of != to and (
+                    self._machine[a] == self._machine[b]):
+                found[of, to] = min(found.get((of, to), least), least)
+        return found
+
+    def _find_machines(self) -> None:
         """Group the processes into machines (rule 2), and find their offsets (rule 3)."""
-        machine = self._machine
+        hosts, machine = self._clock, list(range(len(self._pids)))
+        self._machine = machine
         apart = {pair for pair, least in self._ways.items() if least < 0}
         # a computer with messages that are received before they were published has no one clock
         odd = {hosts[self._pids[a]] for a, b in apart
@@ -111,6 +134,15 @@ class ImportedClocks:
 
     def lines(self) -> Iterator[str]:
         """Yield what is assumed about the clocks, and what is not judged."""
+        for one, other in {(min(way), max(way)): None for way in self._assumed}:
+            both = [self._assumed[way] for way in ((one, other), (other, one))
+                    if way in self._assumed]
+            yield (f'the clocks of the computers {self._host[one]} and {self._host[other]} are '
+                   'assumed to be synchronised: ' + (
+                       f'by the messages both ways they differ by less than {max(both) / 1e6:.3f} '
+                       'ms' if len(both) > 1 else
+                       'no messages both ways show how they differ, and latencies and response '
+                       'times between them are off by the difference'))
         for of, (ahead, uncertainty) in self._offsets.items():
             if of != 0:
                 yield (

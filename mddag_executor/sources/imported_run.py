@@ -104,7 +104,8 @@ class ImportedRun:
             raise no_run(reader)
         self._link()
         self._clocks = ImportedClocks(self.links, {
-            event[2]: str(event[4:]) for event in self._events.others if event[0].name == HOST})
+            event[2]: (event[4], event[5]) for event in self._events.others
+            if event[0].name == HOST})
         if self._clocks.shift:
             self._events = moved(self._events, self._clocks.shift)
             self._link()

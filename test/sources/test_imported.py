@@ -190,17 +190,18 @@ def test_an_execution_that_is_late_by_nearly_a_period(starts, tmp_path):
 SHOW = 17
 
 
-def two_computers(path, skew=0, back=False, ways=2 * MS, hosts=None):
+def two_computers(path, skew=0, back=False, ways=2 * MS, hosts=(), boots=None):
     """
     Write a camera, and on another computer, whose clock is behind, what detects and plans.
 
-    :param hosts: the names of the computers of three processes, of which the last, on the other
-        computer as well, only shows images: no messages both ways say how its clock differs.
+    :param hosts: the names of the computers of two or three processes, of which the third, on the
+        other computer as well, only shows images: no messages both ways say how its clock differs.
+    :param boots: the boots of the computers, if they are not those of their names.
     """
     r = Recorded(path)
-    for pid, host in enumerate(hosts or (), 1):
-        r.add('mddag:host', 0, 1, host, f'boot of {host}', pid=pid)
-    if hosts:
+    for pid, (host, boot) in enumerate(zip(hosts, boots or hosts), 1):
+        r.add('mddag:host', 0, 1, host, f'boot of {boot}', pid=pid)
+    if len(hosts) > 2:
         r.node(3, '/show', pid=3)
         r.subscription(SHOW, 3, '/image', time=-skew, pid=3)
     r.node(1, '/camera')
@@ -215,7 +216,7 @@ def two_computers(path, skew=0, back=False, ways=2 * MS, hosts=None):
         r.run(GRAB, 1, at, at + 2 * MS)
         image = r.publish(IMAGE, 1, at + MS)
         r.receive(DETECT, 2, at + MS + ways - skew, at + MS + ways + 4 * MS - skew, image, pid=2)
-        if hosts:
+        if len(hosts) > 2:
             r.receive(SHOW, 3, at + MS + ways - skew, at + MS + ways + MS - skew, image, pid=3)
         if back:
             boxes = r.publish(BOXES, 2, at + 5 * MS - skew, pid=2)
@@ -259,6 +260,22 @@ def test_processes_of_one_computer_have_one_clock(tmp_path):
         shown = result['dags']['/camera']['sinks']['/show:show']
         assert shown['completed'] == judged, warnings
         assert any('clocks of computers differ' in line for line in warnings) == (not judged)
+
+
+@pytest.mark.parametrize(('skew', 'back', 'boots', 'says'), [
+    (-5 * MS, False, None, 'no messages both ways show how they differ, and latencies and '
+     'response times between them are off by the difference'),
+    (0, True, None, 'by the messages both ways they differ by less than 1.996 ms'),
+    (0, False, ('one', 'one'), None)], ids=['one way', 'both ways', 'two containers'])
+def test_clocks_of_computers_that_are_assumed_to_be_synchronised(
+        tmp_path, skew, back, boots, says):
+    path = two_computers(tmp_path / 'two.mcap', skew, back, hosts=('camera', 'main'), boots=boots)
+    result, warnings = result_of(path, loads(TWO if back else CAMERA, 'graph.yaml'))
+    said = [line for line in warnings if 'clock' in line]
+    assert said == ([] if says is None else [
+        f'the clocks of the computers camera and main are assumed to be synchronised: {says}'])
+    camera = result['dags']['/camera']
+    assert (camera['unjudged'], camera['jobs']) == (0, 10)
 
 
 @pytest.mark.parametrize('skew', [3 * MS, 5 * MS, 400 * MS])
