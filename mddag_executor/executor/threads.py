@@ -17,6 +17,7 @@ from mddag_executor.executor.attribution import PublisherState
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.forks import end_copy
 from mddag_executor.executor.gil import Measurement
 from mddag_executor.executor.pausing import Pause
 from mddag_executor.executor.work import Refused, Work
@@ -108,6 +109,7 @@ class WorkerThread:
     :ivar paused_ns: for how long the running callback has paused.
     :ivar pause: the pause of the callback that it has just overtaken.
     :ivar waits_since: since when it has waited in the epoll, on the trace's clock.
+    :ivar is_copy: whether its callback has forked this process, which is the child.
     :ivar is_spare: whether its last callback has left the events to another thread.
     :ivar published: when the running callback first published (monotonic ns); 0: not yet.
     :ivar start: when the execution that has just ended began; ``end``: when it ended (on the
@@ -119,7 +121,7 @@ class WorkerThread:
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
                  'state', 'is_spare', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
                  'waits_since', 'waits_for', 'is_out', 'measurement', 'pause', 'paused_ns',
-                 'name', 'since')
+                 'name', 'since', 'is_copy')
 
     def __init__(self, pool: Pool, thread: threading.Thread | None) -> None:
         self.pool = pool
@@ -134,7 +136,7 @@ class WorkerThread:
         self.waits = self.has_lent = self.is_out = False
         self.measurement: Measurement | None = None
         self.pause: Pause | None = None
-        self.is_spare = False
+        self.is_spare = self.is_copy = False
         self.state = ThreadState.RUNNING if thread is None else ThreadState.PARKED
         self.published = self.start = self.end = self.waits_since = self.paused_ns = 0
         self.since = 0
@@ -216,6 +218,8 @@ class WorkerThread:
             return
         except BaseException as error:
             self.outcome = from_user_code(error)
+        if self.is_copy:
+            end_copy(work, self.outcome)
         if group is not None and (
                 self.outcome is None or isinstance(self.outcome, BaseException)):
             group.ending_execution(entity.rclpy_object)

@@ -38,6 +38,7 @@ class Runner(Protocol):
     """The thread that runs a callback: see ``workers.WorkerThread``."""
 
     work: Work | None
+    is_copy: bool
     pool: Any
     engine: Any
 

@@ -3,7 +3,9 @@
 """What rclpy promises of executors: contexts, several executors, forks, kinds of nodes."""
 
 import multiprocessing
+import os
 import signal
+import sys
 import threading
 import time
 
@@ -195,6 +197,36 @@ def test_a_forked_process_disturbs_nothing_and_ends(make_executor, make_node):
     assert is_idle(executor)
     for connection in (each for pipe in pipes for each in pipe):
         connection.close()
+
+
+@pytest.mark.filterwarnings('ignore:.*use of fork')
+def test_a_forked_copy_ends_with_the_callback_that_forked_it(make_executor, make_node, capfd):
+    """It would take the events of its parent, and run the nodes a second time."""
+    ends = {'return': lambda: None, 'exit': lambda: sys.exit(5), 'raise': lambda: 1 // 0}
+    statuses = {}
+
+    def forks(name):
+        child = os.fork()
+        if child == 0:
+            ends[name]()
+            return
+        statuses[name] = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+    node = make_node('forking')
+    ticks = counting(node)
+    executor = make_executor(num_workers=2, nodes=[node])
+    task = executor.create_task(forks, 'return')
+    executor.spin_until_future_complete(task, timeout_sec=15.0)  # in this thread
+    assert statuses.pop('return') == 1
+    with Spinning(executor):
+        for name in ends:
+            task = executor.create_task(forks, name)
+            assert wait_for(task.done)
+        assert goes_on(ticks, 5)
+    assert statuses == {'exit': 5, 'raise': 1, 'return': 1}
+    said = capfd.readouterr().err
+    assert said.count('forked this process and returned in the copy') == 2, said
+    assert 'ZeroDivisionError' in said
 
 
 # --- kinds of nodes and events -------------------------------------------------------------------
