@@ -13,7 +13,8 @@ Known values become entries. An unknown value becomes a comment with ``FILL IN``
 which is an entry once its first ``# `` is removed. While blanks are open, they are the errors of
 the declaration (``open_blanks``), since most others follow from them:
 
-1. *deadline* of a sink: the shortest period of the sources that lead to it.
+1. *deadline* of a sink: the shortest period of the sources that lead to it; none, if it only
+   stores a message, and is not the only result of its DAG.
 2. *period* of a service, and of a subscription whose topic no callback publishes: the measured
    time between two of its executions, if there is one.
 3. *publishes*, if it is unknown which of a node's callbacks publishes a topic: on each that may.
@@ -69,7 +70,7 @@ class DraftCallback:
         many executions, None if they are declared.
     :ivar judged: of a sink: False if it has no deadline.
     :ivar driven_by: of a sync of different rates, the topic of ``started_by`` that drives it.
-    :ivar why: of a proposed ``driven_by``, a comment with the reason.
+    :ivar why: of a proposed sync, a comment with the reason.
     :ivar least_interval_ns: if the times between its executions are irregular, or it is a service,
         the least of them.
     :ivar came_once: whether it ran only once in a long recording, as for a latched topic.
@@ -261,6 +262,7 @@ class _Writer:
             for topic in callback.triggers:
                 self._started.setdefault(topic, []).append(callback)
         self._fastest = self._fastest_sources()
+        self._only_results = self._find_only_results()
         # the entry that begins with the next line, and the entries by their first line, from 1
         self._next: DraftCallback | DraftPath | None = None
         self._entries_at: dict[int, DraftCallback | DraftPath] = {}
@@ -285,6 +287,29 @@ class _Writer:
                     found[callback.key] = source
                     stack.extend(after for topic in callback.publishes + callback.possible_topics
                                  for after in self._started.get(topic, ()))
+        return found
+
+    def _find_only_results(self) -> set[str]:
+        """
+        Return the callbacks that only store messages of a DAG without other sinks.
+
+        What they store is the result of that DAG: without a deadline for it nothing of the DAG
+        would be judged, and its source would be less urgent than its period.
+        """
+        found: set[str] = set()
+        for source in filter(self._is_source, self._callbacks):
+            seen, stack = {source.key: source}, [source]
+            while stack:
+                callback = stack.pop()
+                for topic in callback.publishes + callback.possible_topics:
+                    for after in self._started.get(topic, ()):
+                        if after.key not in seen:
+                            seen[after.key] = after
+                            stack.append(after)
+            sinks = [each for each in seen.values()
+                     if self._started.keys().isdisjoint(each.publishes)]
+            if source not in sinks and all(each.stores for each in sinks):
+                found.update(each.key for each in sinks)
         return found
 
     def lines(self) -> Iterator[str]:
@@ -339,7 +364,7 @@ class _Writer:
             yield (f'sync: {{topics: {_listed(callback.started_by)}, '
                    f'driven_by: {callback.driven_by}}}{callback.why}')
         elif callback.kind == 'sync':
-            yield f'sync: {_listed(callback.started_by)}'
+            yield f'sync: {_listed(callback.started_by)}{callback.why}'
         else:
             yield f'{callback.kind}: {callback.started_by[0]}'
         if callback.dag and self._is_source(callback):
@@ -420,7 +445,8 @@ class _Writer:
         if callback.deadline_ns is not None and not callback.possible_topics:
             return f'deadline: {exact_duration(callback.deadline_ns)}'
         what = 'if it is a sink' if callback.possible_topics else 'a sink'
-        if callback.stores and not callback.possible_topics:
+        if (callback.stores and not callback.possible_topics
+                and callback.key not in self._only_results):
             return self._proposal('deadline: none', what, 'it seems to only store its message')
         source = self._fastest.get(callback.key)
         if source is None:

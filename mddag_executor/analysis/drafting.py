@@ -20,8 +20,12 @@ Theory of operation
 5. A service without calls, and a subscription without messages whose topic no callback publishes,
    have no rate, so they cannot be the source of a DAG.  They are left out and reported.
 6. A timer that was made after another one of its node, with the same period and function, had
-   fired, is the same callback, made again (``sporadic``).
-7. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
+   fired, is the same callback, made again (``sporadic``).  So is a timer that was reset: its due
+   times are not whole periods apart, or the only one is much later than a period after it was
+   made.
+7. Subscriptions of a node are one sync (``_find_syncs``) if the messages that they publish have
+   the header stamps of several of their topics, or are as many as the messages of one of them.
+8. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
    that completed it: the others only store a message.
 """
 
@@ -35,7 +39,7 @@ from typing import NamedTuple
 from mddag_executor.core import quantile
 from mddag_executor.errors import InputError
 from mddag_executor.recording.columns import Ints, Mask
-from mddag_executor.recording.joins import rows_by, sort_by
+from mddag_executor.recording.joins import rows_by, sort_by, whole_periods
 from mddag_executor.recording.mapping import declared_keys
 from mddag_executor.recording.names import Callback, KINDS
 from mddag_executor.recording.recording import Recording
@@ -67,6 +71,10 @@ ONCE_PERIODS = 3
 """A timer fires once if it was silent for this many periods after its only execution."""
 NEVER_PERIODS = 20
 """A timer never fires if a recording of this many periods has no execution of it."""
+RESET_SHARE = 0.1
+"""A timer was reset if a larger share of its due times are off its period."""
+_MADE_NS = 50_000_000
+"""When a timer was made is recorded this much earlier or later at most."""
 LEAST_COPIED = 5
 """From fewer messages with header stamps nothing is concluded."""
 _NO_STAMPS: Ints = np.empty(0, dtype=np.int64)
@@ -77,12 +85,14 @@ class Runs(NamedTuple):
     The executions of a callback.
 
     :ivar starts: of each, ns; ``times``: how long each took, all pieces together.
+    :ivar due: of a timer, when each was due, as far as it is known, ns.
     :ivar whole: which of them completed a vertex.
     :ivar topics: what they published on, in the order of time.
     :ivar published: by topic, in how many executions it was published.
     """
 
     starts: Ints
+    due: Ints
     times: Ints
     whole: Mask
     topics: list[str]
@@ -180,8 +190,9 @@ class System:
             self._made_again.add(before.number)
             if runs is not None and again is not None:
                 again = Runs(
-                    np.append(runs.starts, again.starts), np.append(runs.times, again.times),
-                    np.append(runs.whole, again.whole), runs.topics + again.topics, {
+                    np.append(runs.starts, again.starts), np.append(runs.due, again.due),
+                    np.append(runs.times, again.times), np.append(runs.whole, again.whole),
+                    runs.topics + again.topics, {
                         topic: runs.published.get(topic, 0) + again.published.get(topic, 0)
                         for topic in {**runs.published, **again.published}})
             if again is not None:
@@ -208,22 +219,21 @@ class System:
 
     def _copied_from(
         self, node: str, topic: str, several: list[DraftCallback], total: int
-    ) -> DraftCallback | None:
+    ) -> list[DraftCallback]:
         """
-        Return the one of the subscriptions of a node whose header stamps its messages have.
+        Return those of the subscriptions of a node whose header stamps its messages have.
 
-        None: there are no header stamps, or those of none or several of them; or the same stamp
-        is published again and again, as that of the latest value.
+        None: there are no header stamps; or the same stamp is published again and again, as that
+        of the latest value.
         """
         stamps = np.concatenate([_NO_STAMPS, *(
             self._sent_headers.get((entity.number, topic), _NO_STAMPS)
             for entity in self._entities
             if entity.node_name == node and entity.kind == 'subscription')])
         if len(stamps) < LEAST_COPIED or total > (1 + DRIVEN_SHARE) * len(stamps):
-            return None
-        found = [each for each in several if np.isin(stamps, np.concatenate(
+            return []
+        return [each for each in several if np.isin(stamps, np.concatenate(
             self._headers.get(each.started_by[0], [_NO_STAMPS]))).mean() >= COPIED_SHARE]
-        return found[0] if len(found) == 1 else None
 
     def draft(self) -> Draft:
         """Return the whole system."""
@@ -246,8 +256,9 @@ class System:
                 nodes[name] = DraftNode(name, drafted)
             for each in drafted.values():
                 each.possible_topics.extend(unseen)
+        sources = _Sources(nodes)
         for node in nodes.values():
-            self._find_driven(node)
+            self._find_syncs(node, sources)
             _find_stores(node)
         draft = Draft(
             f'the trace {self.name}', self._ordered(nodes), self._paths(nodes), self.workers)
@@ -286,12 +297,14 @@ class System:
                 if (callback.runs or 0) > LEAST_SILENT:
                     callback.sometimes[topic] = 0, callback.runs or 0
 
-    def _find_driven(self, node: DraftNode) -> None:
+    def _find_syncs(self, node: DraftNode, sources: _Sources) -> None:
         """
         Join the subscriptions of a node that publish one topic from the messages of both.
 
-        They are a sync of different rates if several of them publish the topic, and its messages
-        have the header stamps of just one of their topics, or are as many as those of one.
+        They are a sync of one rate if each of them publishes the topic, its messages have the
+        header stamps of several of their topics, and these have the same source. They are a sync
+        of different rates if several of them publish the topic, and its messages have the header
+        stamps of just one of their topics, or are as many as those of one.
         """
         declared = {callback.key for callback in self._declared.values()}
         subscriptions = [each for each in node.callbacks.values()
@@ -302,12 +315,21 @@ class System:
                     if each.kind == 'subscription' and each.name in node.callbacks]
             several = [each for each in left if topic in each.publishes]
             total = sum(_published_by(each, topic) for each in several)
-            driver = self._copied_from(node.name, topic, left, total)
-            if driver is not None and several != [driver]:
+            copied = self._copied_from(node.name, topic, left, total)
+            if len(copied) > 1:
+                if all(each in several for each in copied) and len(
+                        {sources.of(each.started_by[0]) for each in copied}) == 1:
+                    _join(node, copied[0], copied[1:], topic, (
+                        f'{topic} has the header stamps of '
+                        f'{" and ".join(each.started_by[0] for each in copied)}'), driven=False)
+                    continue
+                copied = []
+            if copied and several != copied:
+                driver, = copied
                 if driver not in several:
                     several.append(driver)
                 why = f'{topic} has the header stamps of {driver.started_by[0]}'
-            elif driver is not None or len({each.started_by[0] for each in several}) < 2:
+            elif copied or len({each.started_by[0] for each in several}) < 2:
                 continue
             else:
                 driver = min(several, key=lambda each: abs((each.runs or 0) - total))
@@ -419,6 +441,8 @@ class System:
                 if silent.get(topic, 0) > max(LEAST_SILENT, LEAST_SILENT_SHARE * count)})
         if entity.number in self._made_again:
             callback.other_keys['sporadic'] = 'true'
+        elif callback.kind == 'timer' and declared is None and _was_reset(entity, runs.due):
+            callback.other_keys['sporadic'] = 'true  # proposed: it was reset'
         elif callback.kind == 'timer' and count == 1 and (
                 'sporadic' not in callback.other_keys
                 and self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
@@ -461,6 +485,32 @@ class System:
         return count
 
 
+class _Sources:
+    """Finds the sources of topics: callbacks that no callback starts, or topics from outside."""
+
+    def __init__(self, nodes: dict[str, DraftNode]) -> None:
+        self._publishers: dict[str, list[DraftCallback]] = {}
+        for node in nodes.values():
+            for callback in node.callbacks.values():
+                for topic in callback.publishes:
+                    self._publishers.setdefault(topic, []).append(callback)
+
+    def of(self, topic: str) -> frozenset[str]:
+        """Return the sources of a topic."""
+        found, seen, stack = set(), {topic}, [topic]
+        while stack:
+            each = stack.pop()
+            publishers = self._publishers.get(each, [])
+            if not publishers:
+                found.add(each)
+            for callback in publishers:
+                if not callback.triggers:
+                    found.add(callback.key)
+                stack.extend(before for before in callback.triggers if before not in seen)
+                seen.update(callback.triggers)
+        return frozenset(found)
+
+
 def _published_by(callback: DraftCallback, topic: str) -> int:
     """Return in how many executions a callback published a topic that it has published."""
     counts = callback.sometimes.get(topic)
@@ -468,15 +518,16 @@ def _published_by(callback: DraftCallback, topic: str) -> int:
 
 
 def _join(
-    node: DraftNode, driver: DraftCallback, others: list[DraftCallback], topic: str, why: str
+    node: DraftNode, driver: DraftCallback, others: list[DraftCallback], topic: str, why: str,
+    driven: bool = True,
 ) -> None:
-    """Make one sync of subscriptions for a topic, which the topic of one of them drives."""
+    """Make one sync of subscriptions for a topic, which the topic of one of them may drive."""
     runs = driver.runs or 0
     driver.why = f'  # proposed: {why}'
     published = {
         each: sum(_published_by(c, each) for c in (driver, *others) if each in c.publishes)
         for each in dict.fromkeys(t for c in (driver, *others) for t in c.publishes)}
-    driver.kind, driver.driven_by = 'sync', driver.started_by[0]
+    driver.kind, driver.driven_by = 'sync', driver.started_by[0] if driven else None
     driver.publishes = list(published)
     driver.sometimes = {
         each: (count, runs) for each, count in published.items()
@@ -507,8 +558,19 @@ def _runs_of(recording: Recording, which: Ints) -> Runs:
     table = table[sort_by(*(table[name] for name in ('vertex', 'job', 'ready', 'start')))]
     first = np.flatnonzero(table['piece'] == 0)
     last = np.append(first, len(table))[1:] - 1
-    return Runs(table['start'][first], table['busy'][last], table['completes'][last] == VERTEX,
-                [], {})
+    due = table['due'][first]
+    return Runs(table['start'][first], due[due > 0], table['busy'][last],
+                table['completes'][last] == VERTEX, [], {})
+
+
+def _was_reset(timer: Callback, due: Ints) -> bool:
+    """Return whether a timer did not keep to its period (rule 6)."""
+    if not len(due) or not 0 < timer.period <= DAY:
+        return False
+    _, is_whole = whole_periods(due, timer.period)
+    off = int((~is_whole).sum())
+    return off > max(1, RESET_SHARE * len(is_whole)) or len(due) == 1 and (
+        int(due[0]) - timer.made > (1 + RESET_SHARE) * timer.period + _MADE_NS)
 
 
 def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:

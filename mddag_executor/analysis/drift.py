@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Set
 
-from mddag_executor.recording.joins import different, distinct, rows_by
+from mddag_executor.recording.joins import different, distinct, rows_by, whole_periods
 from mddag_executor.recording.mapping import declared_keys
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
@@ -47,8 +47,8 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             of.count = len(mine)
             if not (recording.run.declared or dag.sporadic) and key in periods:
                 # skipped releases have no jobs
-                skipped = np.rint(np.diff(np.sort(mine)) / periods[key]) - 1
-                of.count += int(skipped[skipped > 0].sum())
+                periods_between, is_whole = whole_periods(mine, periods[key])
+                of.count += int((periods_between[is_whole] - 1).clip(0).sum())
     # declared callbacks that were started, and other executions, a coroutine's once each
     vertex, start, end = (table[name] for name in ('vertex', 'start', 'end'))
     declared = (vertex >= 0) & (start >= 0)

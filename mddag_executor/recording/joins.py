@@ -94,6 +94,20 @@ def last_of(which: Mask, group: Any, before: bool = False) -> Ints:
     return found
 
 
+_OFF_SHARE = 0.02    # due times are exact, times at which a busy machine noticed them are not
+
+
+def whole_periods(times: Ints, period: int) -> tuple[Ints, Mask]:
+    """
+    Return the periods from each different time to the next one, and where they are a whole number.
+
+    They are not where a timer was reset.
+    """
+    between = np.diff(distinct(times)) / period
+    whole = np.rint(between)
+    return whole.astype(np.int64), (np.abs(between - whole) <= _OFF_SHARE) & (whole > 0)
+
+
 def rows_by(numbers: Any, n: int) -> list[Ints]:
     """Return the rows of each number from 0 to n - 1."""
     order = sort_by(numbers)

@@ -234,7 +234,8 @@ class ImportedRun:
             thread=_values([tid for _, tid in events.threads], runs['thread']),
             start=runs['start'], began=runs['start'], end=runs['end'], message=runs['message'],
             busy=np.where(runs['end'] >= 0, runs['end'] - runs['start'], UNKNOWN),
-            cpu=UNKNOWN, order=UNKNOWN, worker=UNKNOWN, process=self._process_of(runs))
+            cpu=UNKNOWN, order=UNKNOWN, worker=UNKNOWN, process=self._process_of(runs),
+            due=runs['due'])
         table['worker'][ended] = worker[runs['thread'][ended]]
         return table
 

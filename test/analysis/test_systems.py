@@ -98,6 +98,22 @@ def test_subscriptions_that_may_be_a_sync_have_a_comment():
         '      # If these are one sync, declare one callback: sync: [/left, /right]']
 
 
+def test_a_stored_message_is_a_result_if_its_dag_has_no_other():
+    """Else nothing of the DAG were judged, and its source were less urgent than its period."""
+    def stores(name, topic, **keys):
+        return DraftCallback('/n', name, 'subscription', [topic], stores=True, **keys)
+
+    text = declaration_of(Draft('a test', [DraftNode('/n', {each.name: each for each in (
+        DraftCallback('/n', 'imu', 'timer', period_ns=5 * MS, publishes=['/imu']),
+        DraftCallback('/n', 'scan', 'timer', period_ns=9 * MS, publishes=['/scan']),
+        DraftCallback('/n', 'stop', 'subscription', ['/scan']),
+        stores('keep_imu', '/imu'), stores('keep_scan', '/scan'),
+        stores('keep_map', '/map', period_ns=MS))})]), accepted=True)
+    found = {each.name: each.deadline_ns for each in loads(text).callbacks}
+    assert found == {'imu': None, 'scan': None, 'keep_map': None, 'keep_scan': None,
+                     'stop': 9 * MS, 'keep_imu': 5 * MS}
+
+
 def test_names_periods_and_what_no_one_declares(tmp_path):
     r = Recorded(tmp_path / 'n.mcap')
     r.node(100, '/cam')
