@@ -367,7 +367,7 @@ def _with_warning(kind: type[Executor]) -> Callable[..., None]:
             executor.has_warned = True
             get_logger('mddag_executor').warning(
                 f'{kind.__module__}.{kind.__qualname__} has a spin_once of its own: callbacks '
-                'that it runs are neither ordered, recorded nor judged')
+                'that it runs are neither ordered, recorded nor judged: let it call that of rclpy')
         kind.spin_once(executor, *args, **more)
 
     return spin_once

@@ -589,7 +589,7 @@ class Host:
         if guest is not None:
             guest.signals.clear()
 
-    # --- replacements in rclpy and Python --- ----------------------------------------------------
+    # --- replacements in rclpy and Python --------------------------------------------------------
 
     def current_guest(self) -> Guest | None:
         """Return the program that the calling thread belongs to, or None."""
@@ -656,7 +656,7 @@ class Host:
                 guest.uses_ros = True
                 get_logger('mddag_executor').warning(
                     f'--node {guest.program.spec}: it has a context of its own: callbacks '
-                    'in it are neither ordered nor judged here')
+                    'in it are neither ordered nor judged here: let it use the default context')
 
         return init
 

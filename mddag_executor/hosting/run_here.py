@@ -216,8 +216,8 @@ class _Run:
                 raise
         left = host.end(session.is_patient)
         for guest in left:
-            self._warn(f'--node {guest.program.spec}: its main() has not ended in time; '
-                       'it is abandoned')
+            self._warn(f'--node {guest.program.spec}: its main() has not ended in time and is '
+                       'abandoned: let it return when rclpy.ok() is False')
         if left:
             host.interrupt()
         errors = [guest.error for guest in host.guests
@@ -295,7 +295,8 @@ class _Run:
             'exclusion': [*exclusion],
             'drift': [each.result() for each in self._watch.drift(counts)]}
         if not self.session.clean:
-            self._warn('a callback has not ended in time; it is abandoned')
+            self._warn('a callback has not ended in time and is abandoned: let it return when '
+                       'rclpy.ok() is False')
         return RunResult(
             values, tuple(_end_of(guest) for guest in guests), tuple(self._warnings),
             _with_place(error, values, guests),

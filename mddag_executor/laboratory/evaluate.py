@@ -156,8 +156,8 @@ def _local(jobs: int, evaluator: Evaluator) -> Iterator[Submit]:
         with pool:
             yield lambda first, count: pool.submit(evaluator, first, count)
     except BrokenProcessPool:
-        raise UsageError('jobs: a worker process was killed: free some memory, or give a smaller '
-                         '--parallel') from None
+        raise UsageError('--parallel: a worker process was killed: free some memory, or give a '
+                         'smaller number') from None
 
 
 @contextmanager

@@ -79,7 +79,7 @@ def no_end(name: str) -> Loss:
     """Return what a run without recorded end lacks."""
     return Loss('end', 1, (
         f'{name}: the end of the run is not recorded (the process was killed, or the trace is '
-        'cut): what was open is judged at the last recorded instant'))
+        'cut): open jobs are judged at the last recorded instant'))
 
 
 def no_jobs(name: str) -> Loss:

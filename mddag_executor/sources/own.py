@@ -156,7 +156,7 @@ def end_losses(run: Run, n_releases: int, lost: int) -> Iterator[Loss]:
     if lost:
         yield Loss('events', lost, (
             f'{run.name}: {counted(lost, "event")} lost while recording: jobs may be '
-            'missing, or count as late that were not'))
+            'missing, or wrongly count as late'))
     if not n_releases:
         yield no_jobs(run.name)
 

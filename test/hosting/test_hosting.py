@@ -390,8 +390,10 @@ def test_what_does_not_end_is_left_behind(world):
     done = Done(process.returncode, Path('out.txt').read_text(), Path('err.txt').read_text())
     assert heard(done.result) >= 3 and done.result['nodes'] == [*specs]
     for line in (
-        'not JSON', 'warning: a callback has not ended in time; it is abandoned',
-        'warning: --node chat:never_ends: its main() has not ended in time; it is abandoned',
+        'not JSON', 'warning: a callback has not ended in time and is abandoned: let it return '
+        'when rclpy.ok() is False',
+        'warning: --node chat:never_ends: its main() has not ended in time and is abandoned: '
+        'let it return when rclpy.ok() is False',
         'warning: threads that nodes started still run and are abandoned: stubborn',
     ):
         assert line in done.stderr.splitlines()
