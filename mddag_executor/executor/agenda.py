@@ -47,6 +47,10 @@ class Agenda:
         self._appointments = 0
         self.next = self.latest = NEVER
 
+    def __len__(self) -> int:
+        """Return how many entries the larger heap has, with cancelled ones."""
+        return max(len(self._heap), len(self._latest))
+
     def set(self, appointment: Appointment, at: int, latest: int) -> None:
         """Set an appointment, which may be set already, for a time."""
         if appointment.entry:

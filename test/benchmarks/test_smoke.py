@@ -25,7 +25,7 @@ nodes:
 """
 
 
-def call(*arguments):
+def run_benchmark(*arguments):
     """Run a benchmark, not compiled, and without the checks for debugging."""
     return subprocess.run(
         [sys.executable, '-m', 'benchmarks', *map(str, arguments)], cwd=TOP,
@@ -34,7 +34,7 @@ def call(*arguments):
 
 
 def result_of(*arguments):
-    done = call(*arguments, '--json', '-')
+    done = run_benchmark(*arguments, '--json', '-')
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -91,7 +91,7 @@ def test_evaluate(graph):
 
 
 def test_a_wrong_command_line_is_one_line():
-    done = call('live', '--load', 'topics', '--executors', 'rad-events')
+    done = run_benchmark('live', '--load', 'topics', '--executors', 'rad-events')
     assert done.returncode == 2
     assert done.stderr == (
         "error: --executors: 'rad-events' is unknown: give some of rad, single, multi, events, "

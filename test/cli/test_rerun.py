@@ -24,14 +24,14 @@ def drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp('rerun')
     for name in ('graph.yaml', 'robot.py'):
         shutil.copy(EXAMPLE / name, folder)
-    mddag(folder, 'simulate', 'graph.yaml', '--duration', '5s', '--trace', 'releases.mcap')
-    mddag(folder, 'rerun', 'releases.mcap', 'graph.yaml', '--node', 'robot:Lidar', '-o',
+    run_in(folder, 'simulate', 'graph.yaml', '--duration', '5s', '--trace', 'releases.mcap')
+    run_in(folder, 'rerun', 'releases.mcap', 'graph.yaml', '--node', 'robot:Lidar', '-o',
           'drive.mcap')
     return folder
 
 
-def mddag(folder, *args, status=0, python=('-m', 'mddag_executor'), **more):
-    """Run mddag in a folder, as a user would who has fixed the hashes: else it starts twice."""
+def run_in(folder, *args, status=0, python=('-m', 'mddag_executor'), **more):
+    """Run `mddag` in a folder, as a user would who has fixed the hashes: else it starts twice."""
     done = subprocess.run(
         [sys.executable, *python, *args], cwd=folder, capture_output=True, text=True,
         check=False, timeout=120, env={'PYTHONHASHSEED': '0', **os.environ, **more})
@@ -40,34 +40,34 @@ def mddag(folder, *args, status=0, python=('-m', 'mddag_executor'), **more):
 
 
 def digest(folder, *args, **more):
-    return json.loads(mddag(folder, *args, '--json', '-', **more).stdout)['digest']
+    return json.loads(run_in(folder, *args, '--json', '-', **more).stdout)['digest']
 
 
 def test_a_run_and_its_result(drive, tmp_path):
-    done = mddag(drive, *RERUN, '-o', 'out.mcap', '--trace', 'run.mcap', '--json', 'result.json')
+    done = run_in(drive, *RERUN, '-o', 'out.mcap', '--trace', 'run.mcap', '--json', 'result.json')
     golden.compare('rerun', done.stdout)
     result = json.loads((drive / 'result.json').read_text())
     assert result['topics'] == {'/brake': 50, '/parameter_events': 4, '/track': 50}
     assert result['messages'] == 104
     assert (result['callbacks'], result['warnings'], result['recorded']) == (100, [], [])
     assert result['dags']['brake']['sinks']['/brake:decide']['completed'] == 50
-    replayed = mddag(drive, 'replay', 'run.mcap', '--json', '-')
+    replayed = run_in(drive, 'replay', 'run.mcap', '--json', '-')
     sinks = json.loads(replayed.stdout)['dags']['brake']['sinks']
     assert sinks['/brake:decide']['response_ns']['max'] == 9_000_000
     # The same again, and with another gain.
     expect = (*RERUN, '--expect', 'out.mcap')
-    assert 'the same as out.mcap' in mddag(drive, *expect).stdout
+    assert 'the same as out.mcap' in run_in(drive, *expect).stdout
     for name in ('graph.yaml', 'robot.py', 'drive.mcap', 'out.mcap'):
         shutil.copy(drive / name, tmp_path)
     text = (tmp_path / 'robot.py').read_text()
     (tmp_path / 'robot.py').write_text(text.replace('GAIN = 0.3', 'GAIN = 0.3001'))
-    assert mddag(tmp_path, *expect, status=1).stdout.splitlines()[-1].startswith(
+    assert run_in(tmp_path, *expect, status=1).stdout.splitlines()[-1].startswith(
         '/track: content, first in message 1 at 0.110000 s: data is ')
     difference, = json.loads(
-        mddag(tmp_path, *expect, '--json', '-', status=1).stdout)['differences']
+        run_in(tmp_path, *expect, '--json', '-', status=1).stdout)['differences']
     assert (difference['topic'], difference['field'], difference['number']) == (
         '/track', 'data', 1)
-    mddag(tmp_path, *expect, '--allow-difference', '1%')
+    run_in(tmp_path, *expect, '--allow-difference', '1%')
 
 
 @pytest.mark.slow
@@ -94,12 +94,12 @@ def test_unmodified_programs(drive, tmp_path):
     prefix = str(THIRD_PARTY / 'install')
     args = ('rerun', str(drive / 'drive.mcap'), graph, '--node', 'their_robot/talker.py',
             '--node', 'their_robot/listener.py')
-    first = mddag(tmp_path, *args, '-o', 'chatter.mcap', AMENT_PREFIX_PATH=prefix)
+    first = run_in(tmp_path, *args, '-o', 'chatter.mcap', AMENT_PREFIX_PATH=prefix)
     assert 'heard 49 messages' in first.stdout
-    again = mddag(tmp_path, *args, '--expect', 'chatter.mcap', AMENT_PREFIX_PATH=prefix)
+    again = run_in(tmp_path, *args, '--expect', 'chatter.mcap', AMENT_PREFIX_PATH=prefix)
     assert 'the same as chatter.mcap' in again.stdout
     # The listener alone: the messages of the talker are in the bag.
-    alone = mddag(tmp_path, 'rerun', 'chatter.mcap', graph, '--node', 'their_robot/listener.py',
+    alone = run_in(tmp_path, 'rerun', 'chatter.mcap', graph, '--node', 'their_robot/listener.py',
                   AMENT_PREFIX_PATH=prefix)
     assert 'heard 49 messages' in alone.stdout
 
@@ -128,12 +128,12 @@ def test_hashes_are_fixed_however_the_program_is_installed(drive, monkeypatch):
     script.write_text(main)
     digests = set()
     for python in ((str(script),), (str(script),), ('-m', 'mddag_executor')):
-        done = mddag(drive, *MADE, python=python, PYTHONPATH=os.getcwd())
+        done = run_in(drive, *MADE, python=python, PYTHONPATH=os.getcwd())
         digests.add(json.loads(done.stdout)['digest'])
         assert not done.stderr
     assert len(digests) == 1
     for python in (('-E', '-m', 'mddag_executor'), ('-c', main)):
-        said = mddag(drive, *MADE, python=python).stderr
+        said = run_in(drive, *MADE, python=python).stderr
         assert said.startswith('warning: hashes of strings are not the same in each run: ')
         assert said.count('\n') == 1
 
@@ -150,7 +150,7 @@ def test_hashes_are_fixed_however_the_program_is_installed(drive, monkeypatch):
 def test_bad_input_is_one_line(drive, args, message):
     (drive / 'typo.py').write_text((drive / 'robot.py').read_text().replace('/track', '/trak'))
     before = {path.name for path in drive.iterdir()} | {'__pycache__'}
-    done = mddag(drive, 'rerun', *args, '-o', 'new.mcap', status=2)
+    done = run_in(drive, 'rerun', *args, '-o', 'new.mcap', status=2)
     errors = [line for line in done.stderr.splitlines() if line.startswith('error: ')]
     assert len(errors) == 1 and message in errors[0] and 'Traceback' not in done.stderr, errors
     assert {path.name for path in drive.iterdir()} | {'__pycache__'} == before

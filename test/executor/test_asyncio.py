@@ -27,6 +27,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import Spinning, wait_for
 from .declared import graph
+from .inside import engine_of, pool_of
 
 needs_timeout = pytest.mark.skipif(
     sys.version_info < (3, 11), reason='asyncio.timeout is new in Python 3.11')
@@ -393,8 +394,8 @@ def test_coroutines_that_await_asyncio_at_the_end_are_cancelled(ros_context, mak
 
 def begun(executor):
     """Return the names of the coroutines that are suspended."""
-    with executor._pool.lock:
-        return [str(work.coroutine.get_coro()) for work in executor._engine.begun()]
+    with pool_of(executor).lock:
+        return [str(work.coroutine.get_coro()) for work in engine_of(executor).begun()]
 
 
 def test_a_coroutine_may_fail_when_it_is_cancelled_at_the_end(ros_context, make_node, capfd):
@@ -467,7 +468,7 @@ def test_the_turnstile_outlives_an_interrupt_and_a_finalizer(make_executor):
     turnstile.acquire()
 
     executor, is_held, ends = make_executor(), threading.Event(), threading.Event()
-    loop = executor._pool.loops().loop()
+    loop = pool_of(executor).loops().loop()
 
     def hold():
         loop.own()
@@ -478,7 +479,7 @@ def test_the_turnstile_outlives_an_interrupt_and_a_finalizer(make_executor):
     holder = threading.Thread(target=hold)
     holder.start()
     assert is_held.wait(15)
-    with executor._pool.lock:  # where garbage may be collected
+    with pool_of(executor).lock:  # where garbage may be collected
         loop.call_soon(int)
     ends.set()
     holder.join()

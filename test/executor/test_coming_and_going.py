@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import matched, Spinning, wait_for
 from .declared import graph
+from .inside import pool_of, registry_of
 
 # --- while others run ----------------------------------------------------------------------------
 
@@ -244,7 +245,7 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
 
     def nothing_left():
         gc.collect()
-        return len(executor._registry.by_id) == 0 and not executor._registry._retired
+        return len(registry_of(executor).by_id) == 0 and not registry_of(executor)._retired
 
     with Spinning(executor) as spinning:
         cycle(SETTLED)
@@ -282,8 +283,8 @@ def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_cont
                       *subscription.event_handlers, node.create_timer(100.0, print)]
             n_things = len(things) - 1  # publishers are not kept
             executor.add_node(node)
-            assert wait_for(lambda: len(executor._registry.by_id) >= n_things
-                            and executor._pool.is_current)
+            assert wait_for(lambda: len(registry_of(executor).by_id) >= n_things
+                            and pool_of(executor).is_current)
             left = [weakref.ref(thing) for thing in (node, *things)]
             assert len(left) > 6
             node.destroy_node()

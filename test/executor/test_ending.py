@@ -19,6 +19,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 
 from .conftest import Spinning, wait_for
+from .inside import pool_of
 
 LIMIT = resource.RLIMIT_NOFILE
 
@@ -110,7 +111,7 @@ def test_the_end_of_its_context_frees_an_executor_that_does_not_spin(has_spun, n
         rclpy.shutdown(context=context)
         assert wait_for(lambda: threading.active_count() == before)
         if has_spun:
-            assert wait_for(lambda: executors[-1]._pool.loop._bell < 0)
+            assert wait_for(lambda: pool_of(executors[-1]).loop._bell < 0)
             counts.append(used())
     assert len(set(counts)) == has_spun
     for executor in executors:
@@ -130,40 +131,40 @@ def test_shutdown_in_a_handler_that_interrupts_the_executor_itself(ros_context):
     executor.add_node(node)
     with Spinning(executor) as spinning:
         assert wait_for(lambda: len(node.heard) >= 3)
-        with executor._pool.lock:
+        with pool_of(executor).lock:
             assert not executor.shutdown()
         spinning.join()
-        assert executor.is_gone() and executor._pool.loop._bell < 0
+        assert executor.is_gone() and pool_of(executor).loop._bell < 0
 
 
 def test_an_interrupt_at_the_end_of_a_spin_leaves_an_executor_that_can_be_shut_down(monkeypatch):
     context = Context()
     rclpy.init(context=context)
     executor = MultiDeadlineExecutor(context=context)
-    close = executor._pool.close
+    close = pool_of(executor).close
 
     def interrupted(timeout):
-        monkeypatch.setattr(executor._pool, 'close', close)
+        monkeypatch.setattr(pool_of(executor), 'close', close)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(executor._pool, 'close', interrupted)
+    monkeypatch.setattr(pool_of(executor), 'close', interrupted)
     executor.create_task(rclpy.shutdown, context=context)
     with pytest.raises(KeyboardInterrupt):
         executor.spin()
     assert not executor.is_spinning
-    assert executor.shutdown(5.0) and executor._pool.loop._bell < 0
+    assert executor.shutdown(5.0) and pool_of(executor).loop._bell < 0
     executor.spin_once(0.0)
 
 
 def test_an_interrupt_of_a_pause_does_not_keep_the_workers_awake(make_executor, monkeypatch):
     executor = make_executor()
-    wait = executor._pool._all_left.wait
+    wait = pool_of(executor)._all_left.wait
 
     def interrupted(timeout):
-        monkeypatch.setattr(executor._pool._all_left, 'wait', wait)
+        monkeypatch.setattr(pool_of(executor)._all_left, 'wait', wait)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(executor._pool._all_left, 'wait', interrupted)
+    monkeypatch.setattr(pool_of(executor)._all_left, 'wait', interrupted)
     with pytest.raises(KeyboardInterrupt):
         executor.spin_until_future_complete(Future(), 0.05)
     executor.spin_until_future_complete(executor.create_task(lambda: None), 5.0)
@@ -197,7 +198,7 @@ def test_a_thread_that_cannot_be_started_is_started_by_the_next_spin(
         assert wait_for(lambda: len(ran) >= before + 3)
         names = {thread.name for thread in threading.enumerate()}
         assert names >= {'mddag-diagnostics', 'mddag-wait-set', 'mddag-deadline-misses'}
-        assert len(executor._pool._threads) == 3
+        assert len(pool_of(executor)._threads) == 3
 
 
 def test_too_many_open_files_leave_nothing_behind(ros_context, monkeypatch, tmp_path):

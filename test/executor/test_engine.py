@@ -26,6 +26,7 @@ from ..core.task_sets import Case, cases, TICK
 from ..invariants import broken_invariants
 from .conftest import Spinning, wait_for
 from .declared import graph
+from .inside import engine_of, pool_of
 
 HORIZON = 60
 MS = 1_000_000
@@ -608,11 +609,11 @@ def test_how_long_a_timer_may_stay_unnoticed(make_executor, kind, deadline, part
     """For a part of deadline or period; one whose callback waits not at all."""
     task_set = loads(graph(n=f'name: tick, timer: 10ms, deadline: {deadline}'))
     executor = make_executor(task_set)
-    entity = entity_of(executor._engine, task_set, 0, 0, TimerLike)
+    entity = entity_of(engine_of(executor), task_set, 0, 0, TimerLike)
     if kind == 'undeclared':
         entity.callback, entity.source = None, -1
     entity.habit = GilHabit(kind != 'waits')
-    assert executor._pool.due.allowance(entity, 10 * MS) == part * MS
+    assert pool_of(executor).due.allowance(entity, 10 * MS) == part * MS
 
 
 class Steps:
@@ -807,9 +808,9 @@ def test_a_broken_invariant_ends_the_spin(make_executor, make_node):
     executor = make_executor(nodes=[node])
     with Spinning(executor, raises=InvariantError) as spinning:
         assert wait_for(lambda: ticks)
-        count(executor._engine, N_HOLDING)
+        count(engine_of(executor), N_HOLDING)
         spinning.join()
-        executor._engine._state.scalars[N_HOLDING] -= 1
+        engine_of(executor)._state.scalars[N_HOLDING] -= 1
     assert 'mddag-worker-' in str(spinning.error)  # what threads did before
 
 

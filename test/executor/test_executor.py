@@ -26,6 +26,7 @@ from std_msgs.msg import Header, Int32
 from std_srvs.srv import Trigger
 
 from .conftest import is_idle, matched, Pulse, Spinning, wait_for
+from .inside import pool_of
 
 MS = 1_000_000
 
@@ -190,7 +191,7 @@ def test_a_rate_that_is_found_before_it_has_its_callback_ends_a_sleep(make_execu
     late = node.create_timer(0.01, None, ReentrantCallbackGroup())
     executor = make_executor(num_workers=1, nodes=[node])
     with Spinning(executor):
-        assert wait_for(lambda: executor._pool.is_current)
+        assert wait_for(lambda: pool_of(executor).is_current)
         rate = Rate(timer, context=node.context)
         task = executor.create_task(lambda: [slept.append(rate.sleep()) for _ in range(3)])
         assert wait_for(task.done)
@@ -203,7 +204,7 @@ def test_a_rate_that_is_found_before_it_has_its_callback_ends_a_sleep(make_execu
 
 def test_one_slow_execution_does_not_make_a_callback_long(make_executor, monkeypatch):
     """Each execution counts the same; short ones are measured seldom."""
-    pool, now, takes = make_executor()._pool, [10**12], [10_000]
+    pool, now, takes = pool_of(make_executor()), [10**12], [10_000]
     monkeypatch.setattr(threads, 'monotonic_ns', lambda: now[0])
     entity = TaskEntity()
     thread = WorkerThread(pool, None)
@@ -236,7 +237,7 @@ def test_the_threads_that_only_check_are_those_that_run_no_callback(make_executo
     """Their CPU times are known by the last end of a callback in each of them."""
     node, seen = make_node(), []
     executor = make_executor(num_workers=3, nodes=[node])
-    pool = executor._pool
+    pool = pool_of(executor)
 
     def look():
         with pool.lock:

@@ -12,6 +12,7 @@ from std_msgs.msg import Int32
 
 from .conftest import Spinning, wait_for
 from .declared import graph
+from .inside import pool_of
 
 
 class Topic:
@@ -76,7 +77,7 @@ def test_messages_that_an_overfull_reader_lost(declared, make_executor, make_nod
         assert wait_for(publisher.get_subscription_count)
         publisher.publish(Int32(data=0))
         assert wait_for(lambda: got == [0])
-        with executor._pool.lock:       # under which messages are taken
+        with pool_of(executor).lock:       # under which messages are taken
             for number in range(1, 6):
                 publisher.publish(Int32(data=number))
         assert wait_for(lambda: got == [0, 5])

@@ -23,6 +23,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import Declared, graph
+from .inside import engine_of, pool_of, registry_of
 
 MS = 1_000_000
 
@@ -92,7 +93,7 @@ def test_what_is_learnt_of_callbacks(make_executor, make_node):
         assert wait_for(lambda: all(ran.count(name) > 12 for name in 'abcd'), 30.0)
         assert wait_for(lambda: found('holds_interpreter') == [False, True], 20.0)
         sleeping, computing = found('interpreter_share')
-    sleeps, computes, empty, lent = executor._engine.scheduler.state.mean[:4]
+    sleeps, computes, empty, lent = engine_of(executor).scheduler.state.mean[:4]
     assert sleeps >= 20 * MS and computes >= 20 * MS
     assert empty < 20 * MS and lent < 20 * MS
     # on a busy machine it is not known how much it would have computed without the others
@@ -140,7 +141,7 @@ class Computing:
     @property
     def habit(self):
         """Return what is known about how long the long one takes."""
-        return next(each.habit for each in self.executor._registry.by_id.values()
+        return next(each.habit for each in registry_of(self.executor).by_id.values()
                     if each.callback is not None and each.callback.name == 'long')
 
     def _long(self):
@@ -197,7 +198,7 @@ def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing):
 @pytest.mark.parametrize('computing', ['elsewhere'], indirect=True)
 def test_no_thread_waits_for_events_while_a_callback_computes(computing):
     waiting = []
-    computing.meanwhile = lambda: waiting.append(computing.executor._pool.polling) or (
+    computing.meanwhile = lambda: waiting.append(pool_of(computing.executor).polling) or (
         len(waiting) > 20)
     assert computing.order('patient') == ['begins', 'ends', 'patient']
     assert not any(waiting)

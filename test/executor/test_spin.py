@@ -28,6 +28,7 @@ from std_srvs.srv import Trigger
 from ..conftest import run_program
 from .conftest import Pulse, Spinning, wait_for
 from .declared import graph
+from .inside import pool_of
 
 # --- what comes out ------------------------------------------------------------------------------
 
@@ -125,7 +126,7 @@ def test_a_callback_that_outlasts_a_spin_leaves_the_next_ones_to_spin_once(make_
 def test_a_spin_wakes_a_worker_that_did_not_leave_after_the_last_one(make_executor, monkeypatch):
     """As it was not scheduled in time, or a second interrupt ended the wait for it."""
     executor = make_executor(num_workers=1)
-    pool, future = executor._pool, Future()
+    pool, future = pool_of(executor), Future()
     with monkeypatch.context() as patched:
         patched.setattr(workers, 'END_S', 0.0)
         patched.setattr(pool.loop, 'wake_all', lambda: None)
@@ -141,7 +142,7 @@ def test_a_spin_wakes_a_worker_that_did_not_leave_after_the_last_one(make_execut
 
 def test_an_interrupt_while_a_spin_ends_lets_threads_wait_in_the_next_one(
         make_executor, monkeypatch):
-    pool = make_executor()._pool
+    pool = pool_of(make_executor())
     pool.start()
     assert wait_for(lambda: pool.polling)
     wake_all = pool.loop.wake_all

@@ -30,14 +30,15 @@ from std_msgs.msg import Header
 from ..conftest import examples
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import graph
+from .inside import engine_of, pool_of, registry_of
 
 MS = 1_000_000
 
 
 def waits_for_no_timer(executor):
     """Tell whether the executor knows of all timers, and none is to become due."""
-    with executor._pool.lock:
-        return executor._pool.is_current and executor._pool.agenda.first() == NEVER
+    with pool_of(executor).lock:
+        return pool_of(executor).is_current and pool_of(executor).agenda.first() == NEVER
 
 
 class Appointed:
@@ -70,7 +71,7 @@ def test_each_appointment_comes_due_once_in_order_and_what_was_changed_leaves_no
                 assert at <= now and at <= min((each[0] for each in expected.values()), default=at)
         assert agenda.first() == min((each[0] for each in expected.values()), default=NEVER)
         assert agenda.first_latest() == min((each[1] for each in expected.values()), default=NEVER)
-        assert len(agenda._heap) <= 2 * len(expected) + 8
+        assert len(agenda) <= 2 * len(expected) + 8
     assert not agenda.handle_next(NEVER, 0)
 
 
@@ -86,7 +87,7 @@ def test_the_deadline_of_a_job_that_was_in_time_wakes_no_thread(make_executor, m
         go.publish(Header())
         assert wait_for(lambda: ran)
         assert wait_for(lambda: executor.statistics()['dags']['once']['ends']['completed'])
-        assert wait_for(lambda: executor._pool.polling and waits_for_no_timer(executor))
+        assert wait_for(lambda: pool_of(executor).polling and waits_for_no_timer(executor))
 
 
 def test_after_a_short_callback_that_is_rare_no_thread_looks(
@@ -95,7 +96,7 @@ def test_after_a_short_callback_that_is_rare_no_thread_looks(
     monkeypatch.setattr('mddag_executor.executor.engine.NET_NS', 600_000 * MS)
     node, was_set = make_node(), []
     executor = make_executor(nodes=[node])
-    pool = executor._pool
+    pool = pool_of(executor)
     node.create_subscription(
         Header, '/go', lambda _: was_set.append(pool.parking.watch.at < NEVER), 10)
     go = node.create_publisher(Header, '/go', 10)
@@ -119,7 +120,7 @@ def test_a_timer_that_becomes_due_while_a_busy_thread_looks_runs(make_executor, 
     """The thread takes the event of the timerfd, so it has to know the time after that."""
     node, ran, ticks, delays = make_node(), [], [], []
     executor = make_executor(nodes=[node])
-    loop = executor._pool.loop
+    loop = pool_of(executor).loop
     poll, timer = loop.poll, loop.timer
 
     def compute():
@@ -174,7 +175,7 @@ def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
     executor = make_executor(nodes=[node])
     with Spinning(executor):
         assert wait_for(lambda: len(resets) >= 50)
-        assert len(executor._pool.agenda._heap) < 50
+        assert len(pool_of(executor).agenda) < 50
     assert not barked
 
 
@@ -186,7 +187,7 @@ def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
     kept = node.create_rate(1.0) if sleeps else node.create_timer(1.0, print)
     executor, other = make_executor(nodes=[node]), make_executor()
     executor._upkeep.refresh()
-    place = executor._at_once if sleeps else executor._pool
+    place = executor._at_once if sleeps else pool_of(executor)
     (source,) = place.timers._timers.values()
     arrived = list(place.loop.sources(place.loop.wait(0)))
     assert source in arrived and place.agenda.first() < NEVER
@@ -226,7 +227,7 @@ def test_a_timer_runs_by_simulated_time_and_by_nothing_else(make_executor, make_
 
     def is_quiet():
         assert wait_for(executor.create_task(lambda: None).done)
-        assert wait_for(lambda: executor._pool.is_current and is_idle(executor))
+        assert wait_for(lambda: pool_of(executor).is_current and is_idle(executor))
 
     with Spinning(executor):
         set_clock(100_000)
@@ -272,8 +273,8 @@ def test_a_timer_without_a_period_stops_no_other_timer(make_executor, make_node,
         assert wait_for(lambda: len(always) == 10)
         before = len(ran), len(often)
         assert wait_for(lambda: len(ran) >= before[0] + 5 and len(often) > before[1] + 5)
-        entity = next(
-            each for each in executor._registry.of_kind(TimerEntity) if each.rclpy_object is timer)
+        entity = next(each for each in registry_of(executor).of_kind(TimerEntity)
+                      if each.rclpy_object is timer)
         assert wait_for(lambda: (entity.ready, entity.skipped) == (11, 0))
         go_on.set()
         assert wait_for(lambda: len(always) >= 20)
@@ -320,7 +321,7 @@ class Released:
         self.executor = make_executor(
             loads(GRAPH.replace('STAMP', stamp)), num_workers=1, nodes=[self.node])
         self.releases = []
-        self.executor._engine.verdicts.on_release = (
+        engine_of(self.executor).verdicts.on_release = (
             lambda dag, release: self.releases.append(release))
 
     def publish(self):
@@ -370,8 +371,8 @@ def test_a_release_is_the_due_time_even_if_that_was_after_the_turn_began(
         name: two, timer: 10ms, dag: b, deadline: 10s"""))
     trace = str(tmp_path / 'trace.mcap')
     executor = make_executor(task_set if declared else None, nodes=[node], trace=trace)
-    handle = executor._pool.due.handle
-    executor._pool.due.handle = lambda *each: (time.sleep(0.012), handle(*each))
+    handle = pool_of(executor).due.handle
+    pool_of(executor).due.handle = lambda *each: (time.sleep(0.012), handle(*each))
     with Spinning(executor):
         assert wait_for(lambda: len(first) >= 10 and len(second) >= 10)
     executor.shutdown(5.0)
@@ -395,9 +396,9 @@ def test_a_message_from_before_the_spin_is_released_when_it_begins(
     time.sleep(0.2)
     begin = executor._trace_clock.now()
     with Spinning(executor):
-        assert wait_for(lambda: got and executor._pool.is_current)
+        assert wait_for(lambda: got and pool_of(executor).is_current)
         assert len(released.releases) == 1 and released.releases[0] >= begin
-        source = executor._registry.by_id[id(released.subscription)]
+        source = registry_of(executor).by_id[id(released.subscription)]
         take = source._take
         source._take = lambda: (take(), time.sleep(0.1))[0]
         time.sleep(0.2)  # no release is before the spin
@@ -420,7 +421,7 @@ def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_n
         matched(publisher, count=2)
         publisher.publish(ClockMessage(clock=TimeMessage(sec=7)))
         assert wait_for(lambda: got and node.get_clock().now().nanoseconds == 7_000 * MS)
-        assert executor._registry.by_id[id(own)].name == '/node:on_clock'
+        assert registry_of(executor).by_id[id(own)].name == '/node:on_clock'
         assert wait_for(lambda: executor.statistics()['callbacks']['/node:on_clock']['ran'] == 1)
 
 

@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import wait_for
 from .declared import graph
+from .inside import engine_of
 
 GRAPH = graph(
     robot="""
@@ -150,8 +151,8 @@ def test_what_runs_long_and_ends_is_recorded_once(
     slow.create_timer(0.01, work)
     executor = make_executor(loads(GRAPH), trace=str(path), nodes=[robot.node, slow])
     notes = []
-    note = executor._engine.note_unfinished
-    executor._engine.note_unfinished = lambda several, now: (
+    note = engine_of(executor).note_unfinished
+    engine_of(executor).note_unfinished = lambda several, now: (
         notes.append(len(several)), note(several, now))
     with Session(executor):
         assert wait_for(lambda: notes.count(2) > 1)

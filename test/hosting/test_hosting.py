@@ -28,6 +28,7 @@ from rclpy.node import Node
 
 from ..cli import golden
 from ..conftest import Done
+from ..executor.inside import engine_of, pool_of
 from .conftest import GUESTS, wait_for
 
 GRAPH = """\
@@ -518,8 +519,8 @@ def test_executors_that_a_program_makes_again_and_again_leave_nothing_behind(def
             host.start(executor, [Program('main', 'main', main)])
             assert wait_for(lambda: host.guests[0].done.is_set(), 60.0)
             assert host.guests[0].error is None
-            assert len(executor._engine.scheduler.state.outer_limit) < 10
-            assert len(executor._pool.outer_groups) + len(host._opened) < 10
+            assert len(engine_of(executor).scheduler.state.outer_limit) < 10
+            assert len(pool_of(executor).outer_groups) + len(host._opened) < 10
         assert wait_for(lambda: session.stopped)
 
 

@@ -1,0 +1,18 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""The parts of an executor that tests look into: their private names are here only."""
+
+
+def pool_of(executor):
+    """Return its worker threads, with their lock and what is due: see ``workers.WorkerPool``."""
+    return executor._pool
+
+
+def engine_of(executor):
+    """Return what decides in it, with the core's state: see ``engine.Engine``."""
+    return executor._engine
+
+
+def registry_of(executor):
+    """Return the entities that it knows: see ``registry.Registry``."""
+    return executor._registry
