@@ -72,23 +72,19 @@
   function enliven(part) {
     const body = part.querySelector('tbody'), titles = [...part.querySelectorAll('th')];
     const search = part.querySelector('input'), button = part.querySelector('button.all');
-    const showAll = () => {
-      for (const row of body.rows) row.hidden = false;
+    const chooseFirst = rove(body);
+    const showAll = () => {       // that fit the search
+      const words = (search ? search.value : '').toLowerCase().split(/\s+/);
+      for (const row of body.rows) {
+        const text = [...row.cells].map((cell) => cell.textContent).join(' ').toLowerCase();
+        row.hidden = !words.every((word) => text.includes(word));
+      }
       if (button) button.remove();
+      chooseFirst();
     };
     if (button) button.addEventListener('click', showAll);
-    if (search) {
-      search.addEventListener('input', () => {
-        showAll();
-        const words = search.value.toLowerCase().split(/\s+/);
-        for (const row of body.rows) {
-          const text = [...row.cells].map((cell) => cell.textContent).join(' ').toLowerCase();
-          row.hidden = !words.every((word) => text.includes(word));
-        }
-      });
-    }
+    if (search) search.addEventListener('input', showAll);
     function sort(title, column) {
-      showAll();
       const names = title.classList.contains('text');       // names from a, figures from the largest
       const first = names ? 'ascending' : 'descending', other = names ? 'descending' : 'ascending';
       const order = title.getAttribute('aria-sort') === first ? other : first;
@@ -99,12 +95,38 @@
       rows.sort(([a], [b]) => sign * (typeof a !== typeof b ? (typeof a < typeof b ? -1 : 1)
         : a < b ? -1 : a > b ? 1 : 0));
       body.append(...rows.map(([, row]) => row));
+      showAll();
     }
     part.classList.add('sortable');
     titles.forEach((title, column) => {
       title.tabIndex = 0;
       activate(title, () => sort(title, column));
     });
+  }
+
+  // Of the rows that show something, Tab reaches one, and the arrows reach the others.
+  function rove(body) {
+    const steps = {ArrowDown: 1, ArrowUp: -1, PageDown: 10, PageUp: -10, Home: -1e9, End: 1e9};
+    const rows = () => [...body.rows].filter((row) => row.dataset.miss || row.dataset.dag);
+    const shown = () => rows().filter((row) => !row.hidden);
+    let chosen;
+    const choose = (row) => {
+      if (chosen) chosen.tabIndex = -1;
+      chosen = row;
+      if (chosen) chosen.tabIndex = 0;
+    };
+    const first = () => choose(shown()[0]);
+    for (const row of rows()) row.tabIndex = -1;
+    if (rows().length) body.closest('.scroll').removeAttribute('tabindex');
+    body.addEventListener('focusin', (event) => choose(event.target.closest('tr')));
+    body.addEventListener('keydown', (event) => {
+      const by = steps[event.key], places = by ? shown() : [], place = places.indexOf(event.target);
+      if (place < 0) return;
+      event.preventDefault();
+      places[Math.max(0, Math.min(place + by, places.length - 1))].focus();
+    });
+    first();
+    return first;
   }
 
   function activate(target, action) {       // by mouse and by keyboard
@@ -186,7 +208,10 @@
     draw.moveTo(x - 5, y - 5);
     draw.lineTo(x + 5, y - 5);
     draw.lineTo(x, y + 5);
+    draw.closePath();
     draw.fill();
+    draw.strokeStyle = colours.page;        // bars under it are red as well
+    draw.stroke();
   }
 
   // --- timelines ---------------------------------------------------------------------------------
@@ -506,11 +531,12 @@
       return {from, to, text: `${time(place * step)} to ${time((place + 1) * step)}: ${n} jobs`};
     });
     if (later) {        // all that is far beyond the deadline, apart from the scale
-      const from = right - 46, words = `${time(later[1])} to ${time(later[2])}`;
+      const from = right - 46, ends = [...new Set([time(later[1]), time(later[2])])];
+      const words = ends.join(' to ');
       draw.fillStyle = colours.missed;
       draw.fillRect(from, y(later[0]), 34, bottom - y(later[0]));
       text(draw, '…', right - room + 10, bottom - 4, 'center');
-      text(draw, words, right, bottom + 12, 'right', colours.missed);
+      text(draw, words, right, bottom + 30, 'right', colours.missed);
       found.areas.push({from, to: from + 34, text: `${words}: ${later[0]} jobs`});
     }
     draw.strokeStyle = colours.missed;
@@ -544,7 +570,6 @@
     activate(row, () => { show(missed[Number(row.dataset.miss)]); toTimeline(); });
   }
   for (const row of document.querySelectorAll('#mddag-sinks [data-dag]')) {
-    row.tabIndex = 0;
     activate(row, () => { setFilter(row.dataset.dag); toTimeline(); });
   }
   element('lines').addEventListener('input', () => setFilter(element('lines').value));

@@ -173,7 +173,7 @@ def misses_html(data: ReportData, misses: Table) -> str:
         f'{len(rows)} of {data.timeline.n_missed} (the worst of each sink come first into this '
         'list)')
     table = html_table(header, rows, 3 + len(more),
-                       attributes=[f'data-miss="{i}" tabindex="0"' for i in range(len(rows))])
+                       attributes=[f'data-miss="{i}"' for i in range(len(rows))])
     return '<h2>Missed deadlines</h2>\n' + data_table(
         table, 'search misses', 0, 'misses',
         f'{what}, in the order of time. Click on a title to sort, on a miss to see it in the '

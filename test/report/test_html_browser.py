@@ -215,6 +215,39 @@ def test_misses_are_sorted_and_searched(browser, large):
     assert shown() == []
 
 
+def test_a_table_is_used_by_keyboard(browser, large):
+    """Tab reaches one row of a table, and the arrows reach the others, as sorted and searched."""
+    opened(browser, large)
+
+    def stops():
+        return browser.execute_script("""
+            return [...document.querySelectorAll('tr')].filter(
+              (row) => row.tabIndex === 0 && row.offsetHeight > 0).map(
+              (row) => [row.dataset.dag || '', row.closest('tbody').rows[0] === row]);""")
+
+    def chosen():
+        return browser.execute_script('return document.activeElement.rowIndex')
+
+    assert [first for _, first in stops()] == [True, True]      # a miss and a sink
+    browser.find_element('css selector', '#mddag-misses th:last-child').send_keys('\ue007\t')
+    down, up, end, enter = '\ue015', '\ue013', '\ue010', '\ue007'
+    where = [chosen()]
+    for key in (down, down, up, up, up, end):
+        press(browser, key)
+        where.append(chosen())
+    rows = browser.execute_script('return mddag.missed.length')
+    assert where == [1, 2, 3, 2, 1, 1, rows]
+    press(browser, enter)
+    wanted = browser.execute_script(
+        'return mddag.missed[Number(document.activeElement.dataset.miss)].text')
+    wait_for(lambda: status(browser) == wanted)
+    sink = browser.find_element('css selector', '#mddag-sinks tbody tr:last-child')
+    dag = sink.get_attribute('data-dag')
+    browser.find_element('css selector', '#mddag-sinks input').send_keys(dag)
+    assert stops()[1][0] == dag
+    assert complaints(browser) == []
+
+
 def test_many_sinks_are_shown_on_demand_and_found(browser, tmp_path):
     task_set = msg_graph.loads('mddag: 1\nnodes:\n' + ''.join(
         f'  - node: /n{i}\n    callbacks: '
@@ -233,6 +266,8 @@ def test_many_sinks_are_shown_on_demand_and_found(browser, tmp_path):
     search = browser.find_element('css selector', '#mddag-sinks input')
     search.send_keys('/N5')
     assert sorted(shown()) == ['/n5', *(f'/n5{i}' for i in range(10))]
+    browser.execute_script('document.querySelector("#mddag-sinks th:nth-child(2)").click()')
+    assert sorted(shown()) == ['/n5', *(f'/n5{i}' for i in range(10))]      # still searched
     search.send_keys('\b\b\b')
     assert len(shown()) == 60
     browser.execute_script('document.querySelector("#mddag-sinks th").click()')
