@@ -11,12 +11,13 @@ along its critical chain (see ``chains``):
 * overlap with a recorded stop of the machine: *machine*;
 * before the source is ready: *waited* while all workers were busy, so that none could notice the
   timer or message; else *released late*;
-* ready callback: *group* while another callback of its group ran; else *waited* while all workers
+* ready callback: *group* while another callback of its group ran; else *program* while another
+  callback of its program ran, if that runs them one at a time; else *waited* while all workers
   were busy; else, with an idle worker, *interpreter* while any callback ran that may have held the
   GIL (undeclared callbacks: unknown), *machine* while none ran;
-* the time that a job *waited*, or waited for the *interpreter*, after its demotion counts as
-  *demoted*; or as *less important* if the job could still have been in time when it was demoted,
-  so that it only made way for more important work;
+* the time that a job *waited*, or waited for its *program* or the *interpreter*, after its
+  demotion counts as *demoted*; or as *less important* if the job could still have been in time
+  when it was demoted, so that it only made way for more important work;
 * callback that had not ended when the recording did (``recording.unfinished``), and had run for
   ``HANGS_NS``: *never ended*, and so is the time that others of its group waited for it;
 * running callback: *ran* up to the usual time (its median or, if less, the declared maximum) and
@@ -58,10 +59,10 @@ import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
           'demoted', 'less important', 'dropped', 'destroyed', 'not published', 'lost', 'failed',
-          'other topic', 'never ended')
+          'other topic', 'never ended', 'program')
 (WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, DEMOTED, LESS_IMPORTANT,
- DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, OTHER_TOPIC, NEVER_ENDED, RAN_USUALLY, UNKNOWN,
- SKIPPED) = range(19)
+ DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, OTHER_TOPIC, NEVER_ENDED, PROGRAM, RAN_USUALLY,
+ UNKNOWN, SKIPPED) = range(20)
 #: Kinds of time of a job; the last three are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown', 'skipped')
 #: By cause what to do about it.
@@ -70,6 +71,8 @@ REMEDIES = {
     'ran long': 'make the callback shorter, or declare the time that it takes',
     'interpreter': 'give the nodes processes of their own, or release the lock while computing',
     'group': 'give the callback a group of its own, or a reentrant one',
+    'program': 'if the callbacks of its program may overlap, let them (--concurrent NODE, or a '
+               'MultiThreadedExecutor); else give the node a program of its own',
     'released late': 'look at the timer, or at the way of the message from its sensor',
     'transport': 'let the nodes share a process, or send smaller messages',
     'machine': 'free the CPUs of other work, pin the workers, or take a machine that does not '
@@ -98,7 +101,7 @@ HANGS_NS = 1_000_000_000
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th above the usual time is usual
 _ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
-_WAITS = (*_ON_WORKERS, INTERPRETER, GROUP, NEVER_ENDED)
+_WAITS = (*_ON_WORKERS, INTERPRETER, GROUP, NEVER_ENDED, PROGRAM)
 _MOST_BEHIND = 5
 
 MISSED = np.dtype([
@@ -150,6 +153,7 @@ class Pool(NamedTuple):
     :ivar threads: by thread when callbacks ran in it; None: places are processes.
     :ivar hangs: by execution whether it never ended, and had run for ``HANGS_NS``.
     :ivar blocked: by vertex when such an execution kept its callback group busy.
+    :ivar programs: by vertex when callbacks of its program ran, if that runs one at a time.
     :ivar answers: by execution whether a message of another topic than the driving one started it,
         of a driven sync.
     """
@@ -162,6 +166,7 @@ class Pool(NamedTuple):
     threads: dict[int, Spans] | None
     hangs: Mask
     blocked: dict[int, Spans]
+    programs: dict[int, Spans]
     answers: Mask
 
     def within(self, kind: str, spans: Table) -> Ints:
@@ -176,6 +181,18 @@ class Pool(NamedTuple):
                 spans['place'] == place) if self.threads is None else np.arange(len(spans))
             covered[mine] = getattr(busy, kind).within(spans['begin'][mine], spans['end'][mine])
         return covered
+
+
+class Members(NamedTuple):
+    """Which callbacks exclude each other, by vertex and by callback a number; -1: none."""
+
+    of_vertex: dict[int, int]
+    of_callback: dict[int, int]
+
+    def share(self, vertex: int, callback: int) -> bool:
+        """Return whether a vertex and a callback exclude each other."""
+        number = self.of_vertex.get(vertex, -1)
+        return number >= 0 and number == self.of_callback.get(callback, -1)
 
 
 class Usual(NamedTuple):
@@ -302,7 +319,7 @@ def find(
     if waits.any():
         times[waits] += _waits(spans[waits], left[waits], pool, is_source)
         demoted = np.maximum(0, spans['end'] - np.maximum(spans['begin'], rows['demoted'][of]))
-        for part in (WAITED, INTERPRETER):
+        for part in (PROGRAM, WAITED, INTERPRETER):
             moved = np.where(waits, np.minimum(times[:, part], demoted), 0)
             times[:, part] -= moved
             times[:, DEMOTED] += np.where(rows['outranked'][of], 0, moved)
@@ -383,6 +400,15 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     left = left - times[:, GROUP]
     times[:, NEVER_ENDED] = _blocked(spans, times[:, GROUP], pool)
     times[:, GROUP] -= times[:, NEVER_ENDED]
+    occupied = np.zeros(len(spans), dtype=np.int64)
+    for vertex in distinct(spans['vertex']).tolist():
+        if vertex in pool.programs:
+            mine = np.flatnonzero(spans['vertex'] == vertex)
+            occupied[mine] = pool.programs[vertex].within(
+                spans['begin'][mine], spans['end'][mine])
+    # the group is busy only while the program is
+    times[:, PROGRAM] = np.clip(occupied - np.minimum(spans['more'], occupied), 0, left)
+    left = left - times[:, PROGRAM]
     if pool.threads is not None:
         for thread in distinct(spans['place']).tolist():
             mine = np.flatnonzero(spans['place'] == thread)
@@ -400,7 +426,7 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     times[:, WAITED] = np.where(np.isin(spans['place'], [*pool.busy]), np.minimum(
         left, pool.within('full', spans)), left)
     left = left - times[:, WAITED]
-    some = pool.within('some', spans) - times[:, WAITED] - times[:, GROUP] - times[:, NEVER_ENDED]
+    some = pool.within('some', spans) - times[:, [WAITED, GROUP, NEVER_ENDED, PROGRAM]].sum(axis=1)
     times[:, INTERPRETER] = np.clip(some, 0, left)
     left = left - times[:, INTERPRETER]
     nothing = left >= _NOTHING_NS
@@ -526,14 +552,14 @@ def _given_up(
 
 def behind(
     found: Found, runs: dict[tuple[int, int], Spans], on_workers: dict[tuple[int, int], Spans],
-    group_of: dict[int, int], groups: dict[int, int],
+    group_of: Members, program_of: Members,
 ) -> dict[int, list[tuple[int, int]]]:
     """
     Return by part the callbacks that ran while it waited, and how long, longest first.
 
     :param runs: by callback and place (see ``Pool``) when it ran; ``on_workers``: when its
         executions occupied a worker.  Only those at the place of the part count.
-    :param group_of: by vertex its callback group, ``groups``: by callback; -1: a reentrant one.
+    :param group_of: the callback groups, ``program_of``: the programs that run one at a time.
     """
     every, rows = found.parts, found.misses
     share = 10 * every['ns'] >= (rows['until'] - rows['release'])[every['miss']]
@@ -553,11 +579,12 @@ def behind(
         waited = np.isin(kinds[mine], _ON_WORKERS)
         times[:, waited] = [
             on_workers[key].within(begins[waited], ends[waited]) for key in keys]
-        grouped = np.isin(kinds[mine], (GROUP, NEVER_ENDED))
-        for vertex in distinct(parts['vertex'][grouped]).tolist():
-            others = [i for i, callback in enumerate(callbacks)
-                      if group_of.get(vertex, -1) != groups.get(callback, -2)]
-            times[np.ix_(others, np.flatnonzero(grouped & (parts['vertex'] == vertex)))] = 0
+        for members, causes in ((group_of, (GROUP, NEVER_ENDED)), (program_of, (PROGRAM,))):
+            among = np.isin(kinds[mine], causes)
+            for vertex in distinct(parts['vertex'][among]).tolist():
+                others = [i for i, callback in enumerate(callbacks)
+                          if not members.share(vertex, callback)]
+                times[np.ix_(others, np.flatnonzero(among & (parts['vertex'] == vertex)))] = 0
         for part, column in zip(mine.tolist(), times.T):
             order = np.argsort(-column, kind='stable')[:_MOST_BEHIND].tolist()
             waits[part] = [(callbacks[i], int(column[i])) for i in order if column[i] > 0]

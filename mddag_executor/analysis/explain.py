@@ -26,6 +26,7 @@ from mddag_executor.analysis.causes import (
     find,
     HANGS_NS,
     MACHINE,
+    Members,
     MISSED,
     Never,
     NO_MESSAGE,
@@ -153,7 +154,8 @@ class Explanation:
                 place: self._busy(rows[self._place[rows] == place], hangs)
                 for place in {*([0] if one else ()), *distinct(self._place[rows]).tolist()}},
             [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
-            self._place, of_vertex, threads, hangs, blocked, self._answers())
+            self._place, of_vertex, threads, hangs, blocked, self._busy_programs(rows),
+            self._answers())
 
     def _hangs(self) -> tuple[Mask, dict[int, Spans]]:
         """Return which executions never ended, and by vertex when they blocked its group."""
@@ -172,6 +174,21 @@ class Explanation:
         return found, {vertex: Spans(table['start'][members], table['end'][members])
                        for vertex, of in self._groups.items() if of >= 0
                        and len(members := mine[group == of])}
+
+    def _busy_programs(self, rows: Ints) -> dict[int, Spans]:
+        """Return by vertex when callbacks of its program ran, if that runs one at a time."""
+        of_callback = self._who.programs
+        if not of_callback:
+            return {}
+        table = self._executions
+        numbers, which = different(table['callback'][rows])
+        program = np.array([of_callback.get(each, -1) for each in numbers.tolist()])[which]
+        spans = {}
+        for number in distinct(program[program >= 0]).tolist():
+            mine = rows[program == number]
+            spans[number] = Spans(*crowded(table['start'][mine], table['end'][mine], 1))
+        return {vertex: spans[number] for vertex, number in self._by_vertex(of_callback).items()
+                if number in spans}
 
     def _busy(self, rows: Ints, hangs: Mask) -> Busy:
         """Return when executions occupied all workers, and when they may have held the GIL."""
@@ -369,7 +386,8 @@ class Explanation:
                 runs[callback, place], on_workers[callback, place] = (
                     Spans(table['start'][each], table['end'][each])
                     for each in (mine, mine[table['worker'][mine] >= 0]))
-        return behind(self.found, runs, on_workers, self._groups, self._who.groups)
+        return behind(self.found, runs, on_workers, *(Members(self._by_vertex(of), of) for of in (
+            self._who.groups, self._who.programs)))
 
     @cached_property
     def _vertices(self) -> dict[int, int]:
@@ -382,8 +400,11 @@ class Explanation:
     @cached_property
     def _groups(self) -> dict[int, int]:
         """Return by vertex the callback group of its callback; -1 for a reentrant one."""
-        groups = self._who.groups
-        return {vertex: groups.get(callback, -1) for callback, vertex in self._vertices.items()}
+        return self._by_vertex(self._who.groups)
+
+    def _by_vertex(self, of: dict[int, int]) -> dict[int, int]:
+        """Return by vertex what is known of its callback, or -1."""
+        return {vertex: of.get(callback, -1) for callback, vertex in self._vertices.items()}
 
     @cached_property
     def _names(self) -> dict[int, str]:

@@ -293,7 +293,7 @@ def drop(t: Tables, s: State, x: int, now: int) -> None:
     group = s.x_group[x]
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
         _free_group(s, group)  # its entry may have been its group's in the ready heap
-    s.x_aside[x] = -1
+    _count_wait(s, x, now)
     _let_others(s, x)  # or that of its outer group
     if dag == len(s.free_slot):
         s.undeclared.append(x)
@@ -363,11 +363,16 @@ def _let_others(s: State, x: int) -> None:
         call_next(s, s.x_outer[x])
 
 
+def _count_wait(s: State, x: int, now: int) -> None:
+    """Count how long an execution that starts or is dropped has waited for its outer group."""
+    if s.x_aside[x] >= 0 and s.x_outer[x] >= 0:
+        s.outer_wait[s.x_outer[x]] += now - s.x_aside[x]
+    s.x_aside[x] = -1
+
+
 def _enter_outer(s: State, x: int, outer: int, now: int) -> None:
     """Give an execution that starts a place in its outer group."""
-    if s.x_aside[x] >= 0:
-        s.outer_wait[outer] += now - s.x_aside[x]
-        s.x_aside[x] = -1
+    _count_wait(s, x, now)
     if s.x_place[x] != PLACED:
         s.x_place[x] = PLACED
         s.outer_running[outer] += 1

@@ -359,9 +359,13 @@ class MultiDeadlineExecutor(BareExecutor):
 
     # --- interface for a host of programs --- ----------------------------------------------------
 
-    def new_outer_group(self) -> OuterGroup:
-        """Return a new outer group, which is closed: none of its callbacks starts."""
-        return OuterGroup(self._pool, weakref.WeakMethod(self.create_task_in))
+    def new_outer_group(self, is_single: bool = False) -> OuterGroup:
+        """
+        Return a new outer group, which is closed: none of its callbacks starts.
+
+        :param is_single: at most one of its callbacks will run at a time; a trace says so.
+        """
+        return OuterGroup(self._pool, weakref.WeakMethod(self.create_task_in), is_single)
 
     def put(self, node: Node, group: OuterGroup | None) -> None:
         """Let the callbacks of a node belong to an outer group; None: to none."""

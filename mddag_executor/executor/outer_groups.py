@@ -30,15 +30,18 @@ class OuterGroup:
     who made it, a node or an unfinished task refers to it; then its number is used again.
 
     :param create_task_in: the executor's method that makes tasks of a group.
+    :param is_single: whether at most one of them runs at a time whenever it is open.
     :ivar number: in the core.
     :ivar n_nested: how many of its callbacks wait in a call, or spin an executor themselves.
     """
 
     def __init__(
-        self, pool: WorkerPool, create_task_in: weakref.WeakMethod[Callable[..., Any]]
+        self, pool: WorkerPool, create_task_in: weakref.WeakMethod[Callable[..., Any]],
+        is_single: bool,
     ) -> None:
         self._pool = pool
         self._create_task_in = create_task_in
+        self.is_single = is_single
         with pool.lock:
             while pool.freed_outer_groups:
                 pool.engine.outer.free(pool.freed_outer_groups.popleft())

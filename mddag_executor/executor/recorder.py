@@ -78,6 +78,12 @@ class Recorder:
             except InvalidHandle:
                 continue
 
+    def programs(self, entities: Iterable[Entity]) -> None:
+        """Record entities of programs that run their callbacks one at a time."""
+        for entity in entities:
+            if entity.address:
+                self._say('program', entity.address, entity.outer)
+
     def _node(self, node: Any) -> None:
         address = id(node)
         if node not in self._known:

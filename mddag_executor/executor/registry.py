@@ -176,6 +176,10 @@ class Registry:
             engine.remove(each, now)
         if self._recorder is not None:
             self._recorder.entities(found, added)
+            singles = {group.number for group in self.outer_groups.values()
+                       if group is not None and group.is_single}
+            self._recorder.programs(
+                entity for entity in (*added, *moved) if entity.outer in singles)
         return Changes(added, gone, moved)
 
     def _appear(

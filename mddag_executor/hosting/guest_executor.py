@@ -76,7 +76,7 @@ class HostOfExecutors(Protocol):
     def release(self, node: Node, guest: Guest | None) -> None:
         """Remove a program's node from the executor."""
 
-    def group_of(self, owner: Any) -> Any:
+    def group_of(self, owner: Any, is_single: bool) -> Any:
         """Return the outer group of an executor's callbacks, or a node's; None: none."""
 
     def put(self, node: Node, group: Any) -> None:
@@ -230,7 +230,7 @@ class GuestExecutor:
         owners: list[Any] = [self]
         if self.is_global:
             owners = Executor.get_nodes(self)  # type: ignore[arg-type]
-        groups = [self.host.group_of(owner) for owner in owners]
+        groups = [self.host.group_of(owner, _limit(self) == 1) for owner in owners]
         return [group for group in groups if group is not None]
 
     def _open(self, groups: list[Any], is_step: bool) -> bool:
@@ -269,7 +269,8 @@ class GuestExecutor:
     def _adopt(self, nodes: list[Node]) -> None:
         for node in nodes:
             owner = node if self.is_global else self
-            self.host.put(node, None if self.is_pool else self.host.group_of(owner))
+            self.host.put(node, None if self.is_pool else self.host.group_of(
+                owner, _limit(self) == 1))
             self.host.adopt(node, self.guest)
         if nodes and self.guest is not None:
             self.guest.is_complete = True

@@ -450,14 +450,18 @@ class Host:
             with suppress(ValueError):
                 guest.nodes.remove(node)
 
-    def group_of(self, owner: Any) -> Any:
-        """Return the outer group of an executor's callbacks, or a node's; None: there are none."""
+    def group_of(self, owner: Any, is_single: bool) -> Any:
+        """
+        Return the outer group of an executor's callbacks, or a node's; None: there are none.
+
+        :param is_single: whether the program's own executor would run one callback at a time.
+        """
         if not hasattr(self.executor, 'new_outer_group'):
             return None
         with self._lock:
             group = self._groups.get(owner)
             if group is None:
-                group = self._groups[owner] = self.executor.new_outer_group()
+                group = self._groups[owner] = self.executor.new_outer_group(is_single)
         return group
 
     def note_group(self, group: Any, executor: Any) -> None:

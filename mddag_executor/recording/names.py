@@ -97,6 +97,7 @@ class Names:
     :ivar by_number: callbacks by number; ``publishers``: likewise.
     :ivar nodes: the names of the nodes.
     :ivar groups: by callback its mutually exclusive group; -1: reentrant.
+    :ivar programs: by callback its program, if that runs one callback at a time.
     :ivar symbols: the functions of otherwise unknown callbacks.
     :ivar vertices: by callback a vertex of its declared callback, for executions without job.
     :ivar processes: in a recording of another executor by process id a name.
@@ -111,6 +112,7 @@ class Names:
     publishers: dict[int, Publisher] = field(default_factory=dict)
     nodes: dict[str, None] = field(default_factory=dict)
     groups: dict[int, int] = field(default_factory=dict)
+    programs: dict[int, int] = field(default_factory=dict)
     symbols: dict[int, str] = field(default_factory=dict)
     vertices: Mapping[int, int] = field(default_factory=dict)
     processes: Mapping[int, str] = field(default_factory=dict)

@@ -172,6 +172,24 @@ class Recording:
         """Return by execution the place of its job in ``jobs``; -1: none."""
         return self.jobs.places(self.executions)
 
+    def exclusive_groups(self) -> dict[int, int]:
+        """
+        Return by callback a number that it shares with those that never run while it does.
+
+        These are those of its program, if that runs one callback at a time; else those of its
+        callback group (-1: a reentrant one).  Other callbacks of a program run while one of its
+        coroutines waits, so a program with such a coroutine is left out.
+        """
+        groups, programs = self.names.groups, self.names.programs
+        if not programs:
+            return groups
+        table = self.executions
+        suspended = {programs.get(each) for each in np.unique(
+            table['callback'][table['piece'] > 0]).tolist()}
+        first = 1 + max(groups.values(), default=0)
+        return {**groups, **{callback: first + program for callback, program in programs.items()
+                             if program not in suspended}}
+
     def callbacks(self) -> tuple[Ints, Ints]:
         """Return the numbers of the callbacks that ran, and by execution the callback's index."""
         return self._callbacks

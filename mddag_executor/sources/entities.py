@@ -43,10 +43,12 @@ _GROUPS = (
     'add_callback_group', 'add_callback_group_static_executor',
     'callback_group_to_executor_entity_collector',
     *(f'callback_group_add_{kind}' for kind in KINDS))
+_PROGRAM = 'program'
 _CARET_INIT = 'ros2_caret:caret_init'
 #: Full names of the initialisation events that this executor records, and of all of them.
 OWN_INIT_EVENTS = frozenset([
-    *(f'ros2:{name}' for name in _INIT), *(f'ros2_caret:{name}' for name in _GROUPS)])
+    *(f'ros2:{name}' for name in _INIT), *(f'ros2_caret:{name}' for name in _GROUPS),
+    f'mddag:{_PROGRAM}'])
 INIT_EVENTS = OWN_INIT_EVENTS | {
     *(f'ros2_caret:{name}' for name in _INIT), _CARET_INIT, 'ros2_caret:rmw_implementation'}
 
@@ -115,6 +117,7 @@ class Entities:
         self._holders: Addresses[Callback] = Addresses()
         self._groups: Addresses[tuple[int, bool]] = Addresses()
         self._n_groups = 0
+        self._programs: dict[tuple[int, int], int] = {}
 
     # --- reading ---------------------------------------------------------------------------------
 
@@ -154,7 +157,7 @@ class Entities:
             if same not in seen or 'init_timestamp' not in fields:
                 by_kind.setdefault(name, []).append(fields)
             seen.add(same)
-        for name in (*_INIT, *_GROUPS):
+        for name in (*_INIT, *_GROUPS, _PROGRAM):
             for fields in sorted(by_kind.get(name, ()), key=lambda f: f['_timestamp']):
                 self._one(name, fields)
         self._label()
@@ -199,6 +202,12 @@ class Entities:
             self._callback(kind, f, self._entities[kind], f[f'{kind}_handle'])
         elif name.startswith('callback_group_add_'):
             self._add_to_group(f, name.rpartition('_')[2])
+        elif name == _PROGRAM:
+            callback = self.callbacks.nearest(pid, f['callback'], time)
+            if callback is not None and callback.number:
+                key = pid, f['program']
+                self.names.programs[callback.number] = self._programs.setdefault(
+                    key, len(self._programs))
         elif name in _GROUPS and self._groups.nearest(
                 pid, f['callback_group_addr'], time) is None:
             self._n_groups += 1
@@ -276,8 +285,8 @@ _OPTIONAL = {'queue_depth', 'rmw_handle', 'rmw_publisher_handle', 'rmw_service_h
 def _complete(name: str, fields: Fields) -> bool:
     """Return whether an event has all needed fields, with values of the right types."""
     # CARET's other events that add a group have the same fields
-    event = EVENTS.get(f'ros2:{name}') or EVENTS.get(
-        f'ros2_caret:{name}', EVENTS['ros2_caret:add_callback_group'])
+    event = next((EVENTS[key] for key in (f'ros2:{name}', f'ros2_caret:{name}', f'mddag:{name}')
+                  if key in EVENTS), EVENTS['ros2_caret:add_callback_group'])
     return all(
         isinstance(fields.get(field), str if kind == 'string' else int)
         for field, kind in event.fields if field not in _OPTIONAL

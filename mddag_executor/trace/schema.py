@@ -144,6 +144,8 @@ _ALL = (
     # one for each process
     _event('mddag', 'host', name=_STR, boot=_STR),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
+    # the callback is of a program that runs its callbacks one at a time; the number of the program
+    _event('mddag', 'program', callback=_U64, program=_I64),
     _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
     # the due time of a timer that belongs to no job, 0: unknown

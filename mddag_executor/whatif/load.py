@@ -265,8 +265,8 @@ class LoadBuilder:
                 end, release, 'right')
 
     def _groups(self, rows: Ints, vertex: Ints) -> Ints:
-        """Return numbers of the mutually exclusive groups of executions, or -1."""
-        known = self._recording.names.groups
+        """Return numbers of the groups of executions that exclude each other, or -1."""
+        known = self._recording.exclusive_groups()
         callbacks, which = self._recording.callbacks()
         group_of = [known.get(each, _NOT_RECORDED) for each in callbacks.tolist()]
         # small numbers, which are sorted fast: recorded groups, then declared ones

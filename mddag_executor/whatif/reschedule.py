@@ -265,7 +265,7 @@ def reschedule(
             f'and no execution_time is declared: {listed(work.unknown)}',
             'give a GRAPH that declares it')
     tables = with_groups(
-        tables, builder.callback_of, run.names.groups, declared_first=not run.run.same)
+        tables, builder.callback_of, run.exclusive_groups(), declared_first=not run.run.same)
     left_out = builder.left_out
     del builder     # the load has copies of its data
     if recorded is None:    # of a bag only the load is needed

@@ -36,6 +36,7 @@ PLANS = {
     'ran long': {'took': 20},
     'waited': {'wait': 25, 'others': 2},
     'group': {'wait': 25, 'others': 2, 'workers': 6, 'grouped': True},
+    'program': {'wait': 25, 'others': 2, 'workers': 6, 'holds': True, 'in_program': True},
     'interpreter': {'wait': 25, 'others': 1, 'workers': 6, 'holds': True},
     'released late': {'lag': 15},
     # the message that comes first is only kept
@@ -103,6 +104,8 @@ def test_the_right_cause_is_told(cause, tmp_path):
                     plan.pop('workers', 2))
     if plan.pop('grouped', False):
         trace.group('mutually_exclusive', 1001, 1100)       # of /victim:use and /heavy:first
+    if plan.pop('in_program', False):
+        trace.program(3, 1001, 1100)
     for job in range(JOBS):
         if special == 'sync':
             record_sync(trace, job, **plan if job % 5 == 4 else {})
@@ -117,7 +120,7 @@ def test_the_right_cause_is_told(cause, tmp_path):
         if job['verdict'] == 'late':
             assert sum(part['ns'] for part in job['parts']) == job['until_ns'] - job['release_ns']
             assert cause in [part['cause'] for part in job['parts']]
-    if cause in ('waited', 'group', 'interpreter') and not special:
+    if cause in ('waited', 'group', 'program', 'interpreter') and not special:
         behind = {each['callback'] for job in result['jobs'] for part in job['parts']
                   if part['cause'] == cause for each in part['behind'] if each['ns'] > 5 * MS}
         assert behind == {'/heavy:first', '/heavy:second'}.difference(

@@ -81,3 +81,27 @@ def test_what_waits_moves_with_its_node(make_executor, make_node):
         executor.put(node, opened)
         assert wait_for(lambda: len(got) == 3)
     assert got == ['0', '1', '2']
+
+
+def test_what_is_dropped_while_it_waits_has_waited(make_executor, make_node):
+    """Else an overloaded program seems to have waited only for what ran in the end."""
+    node = make_node()
+    node.create_subscription(
+        Header, '/a', lambda message: None, 1, callback_group=ReentrantCallbackGroup())
+    publisher = node.create_publisher(Header, '/a', 10)
+    executor, go_on = make_executor(num_workers=2, nodes=[node]), threading.Event()
+    group = executor.new_outer_group(is_single=True)
+    executor.put(node, group)
+    group.open(1)
+    with Spinning(executor):
+        matched(publisher)
+        task = executor.create_task_in(group.number, go_on.wait, FAR_S)
+
+        def is_one_dropped():
+            publisher.publish(Header())
+            return executor.statistics()['dropped']
+
+        assert wait_for(is_one_dropped)
+        assert group.take_wait_ns() > 0
+        go_on.set()
+        assert wait_for(task.done)

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 
-from mddag_executor import MultiDeadlineExecutor
+from mddag_executor import MultiDeadlineExecutor, open_recording
 from mddag_executor.defaults import SAME_SIGNAL_S
 from mddag_executor.executor.session import Session
 from mddag_executor.hosting.guest import Guest
@@ -276,7 +276,7 @@ def test_what_was_exclusive_stays_exclusive(world, mddag, monkeypatch):
     monkeypatch.setenv('PYTHONPATH', str(GUESTS), prepend=os.pathsep)
     specs = [f'overlap:{name}' for name in ('spins', 'steps', 'has_threads')]
     done = mddag('run', *(word for spec in specs for word in ('--node', spec)),
-                 '--json', 'result.json')
+                 '--json', 'result.json', '--trace', 'run.mcap')
     assert done.returncode == 0, done.stderr
     says = done.stdout.splitlines()
     assert {'spins: 0 overlaps', 'steps: 0 overlaps'} < {*says}
@@ -285,6 +285,10 @@ def test_what_was_exclusive_stays_exclusive(world, mddag, monkeypatch):
     assert all(each['waited_ns'] > 0 for each in waited)
     assert 'overlap:spins' in [each['program'] for each in waited]
     assert any(line.startswith('callbacks of --node overlap:spins waited ') for line in says)
+    names = open_recording('run.mcap').names
+    programs = {names.by_number[each].node.name: n for each, n in names.programs.items()}
+    assert programs.keys() == {'/spins', '/spins_other', '/steps', '/steps_other'}
+    assert len({*programs.values()}) == 2
 
 
 def test_callbacks_and_tasks_of_programs_may_await_asyncio(world, mddag, monkeypatch):

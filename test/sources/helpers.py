@@ -176,10 +176,20 @@ class Written:
     def group(self, kind, *addresses):
         """Put callbacks (of timers: vertex v of DAG d is 1000 + 100 * d + v) into a group."""
         self.add('add_callback_group', 0, 1, 900, kind)
+        self._timers(addresses)
+        for address in addresses:
+            self.add('callback_group_add_timer', 0, 900, address)
+
+    def program(self, number, *addresses):
+        """Let callbacks belong to a program that runs one at a time."""
+        self._timers(addresses)
+        for address in addresses:
+            self.add('program', 0, address, number)
+
+    def _timers(self, addresses):
         for address in addresses:
             self.add('rcl_timer_init', 0, address, 100 * MS)
             self.add('rclcpp_timer_callback_added', 0, address, address)
-            self.add('callback_group_add_timer', 0, 900, address)
 
     def end(self, at):
         self.add('shutdown', at, ns(at))
