@@ -35,6 +35,8 @@ from msg_graph import Dag, TaskSet
 import numpy as np
 
 _MOST_JOBS = 20_000_000
+_ODD_NS = 5_000_000_000
+"""Stamps that are longer before the arrivals are odd."""
 _STAMPS = {
     'arrival': ('arrival', 'arrival'), 'header_stamp': ('header', 'header stamp'),
     'source_timestamp': ('published', 'publication time')}
@@ -78,7 +80,10 @@ def _source(bag: Bag, dag: Dag) -> tuple[Jobs, str]:
             f'{bag.name}: {np.count_nonzero(~usable)} of {counted(len(order), "message")} of '
             f'{topic} ({stamps.type}) without a {what}, or with one after the arrival or '
             'years before: released at the arrival')
-    return jobs, f'{counted(len(order), "job")} from the {what} of {topic}'
+    away = float(np.median(arrival - release)) if len(order) else 0.0
+    return jobs, f'{counted(len(order), "job")} from the {what} of {topic}' + (
+        f', {away / 1e9:.0f} s before the arrival: was another bag played when it was recorded?'
+        if away > _ODD_NS else '')
 
 
 def _timer_jobs(bag: Bag, period: int) -> Jobs:

@@ -11,8 +11,10 @@ import time
 from benchmarks.known_causes import causes, record
 from mddag_executor import open_recording, replay, reschedule
 from mddag_executor.analysis.drafting import System
+from mddag_executor.clocks import TraceClock
 from mddag_executor.core.tally import total
 from mddag_executor.executor import current_job
+from mddag_executor.executor.stamps import StampedReleases
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
@@ -230,6 +232,21 @@ def test_a_stamp_of_another_clock_is_no_release(
     assert f'/old: the header stamps are {abs(begin - time.time_ns()) / 1e9:.0f}'[:-1] in (
         warnings[0])
     assert ('after' if hours > 0 else 'before') in warnings[0]
+    assert warnings[0].endswith('at the arrivals')
+
+
+def test_a_stamp_that_is_some_seconds_old_counts_and_is_named():
+    """It may be late, or of a bag that is played right after it was recorded."""
+    lines = []
+    releases = StampedReleases(TraceClock(), lines.append)
+    now = releases.clock.now()
+    stamp = time.time_ns()
+    for age in (1, 20, 30):
+        release = releases.release(stamp - age * 10**9, '/old', now)
+        assert abs(now - release - age * 10**9) < 10**9
+    line, = lines
+    assert line.startswith('/old: the header stamps are 20 s before the arrivals')
+    assert "declare 'release_from: arrival'" in line and not releases.is_other
 
 
 def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):

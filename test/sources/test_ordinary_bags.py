@@ -103,6 +103,14 @@ def test_stamps_that_can_not_be_are_said(tmp_path):
         assert re.search(says, warning)
 
 
+def test_header_stamps_of_a_bag_that_was_played_are_named(tmp_path):
+    path = write_bag(tmp_path / 'bag', stamps=[BEGIN - 20 * S + i * 100 * MS for i in range(10)])
+    result = reschedule_bag(path, loads(BY_HEADER, 'g.yaml')).result()
+    assert result['notes'][0] == (
+        '/lidar: 10 jobs from the header stamp of /points, 20 s before the arrival: was another '
+        'bag played when it was recorded?')
+
+
 def test_what_is_not_in_the_bag_is_said(tmp_path):
     path = write_bag(tmp_path / 'bag')
     camera = """\
