@@ -404,6 +404,13 @@ class ImportedRun:
         """Yield missing or doubtful data."""
         name, path = self.name, self._reader.path
         yield from damage(self._reader.warnings, path, name)
+        named = [all(those) for those in zip(*self._events.threads)]
+        if self._imported and not all(named):
+            lacking = [what for what, has in zip(('vpid', 'vtid'), named) if not has]
+            yield Loss('strange', 1, (
+                f'{name}: its events lack the context{"s" * (len(lacking) > 1)} '
+                f'{" and ".join(lacking)}, so what ran in several threads is mixed up, and '
+                'verdicts may be wrong: record with vpid and vtid'))
         if self.who.incomplete:
             yield Loss('strange', self.who.incomplete, (
                 f'{name}: left out: {counted(self.who.incomplete, "event")} of the '

@@ -51,8 +51,12 @@ class Recorded:
     def add(self, name, time, tid, *fields, pid=1):
         self._events.append((BEGIN + time, pid, tid, name, fields))
 
-    def write(self, but=(), stop=None):
-        """Write the file, without the events at these places in the order of time."""
+    def write(self, but=(), stop=None, nameless=()):
+        """
+        Write the file, without the events at these places in the order of time.
+
+        :param nameless: which of pid and tid the tracer did not record.
+        """
         with TraceFile(self.path, overwrite=True) as file:
             file.define(_JAZZY)
             keys = {}
@@ -64,7 +68,8 @@ class Recorded:
             ordered = sorted(self._events, key=lambda event: event[0])
             for place, (time, pid, tid, name, fields) in enumerate(ordered[:stop]):
                 if place not in but:
-                    file.add(keys.get(name, name), time, pid, tid, *fields)
+                    file.add(keys.get(name, name), time, 0 if 'pid' in nameless else pid,
+                             0 if 'tid' in nameless else tid, *fields)
         return self.path
 
     def names(self):

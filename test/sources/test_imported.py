@@ -32,6 +32,15 @@ def result_of(path, graph):
     return outcome.result(), [w.removeprefix(f'{path}: ') for w in outcome.warnings]
 
 
+@pytest.mark.parametrize(('nameless', 'lacks'), [
+    (('pid',), 'context vpid, so'), (('tid',), 'context vtid, so'),
+    (('pid', 'tid'), 'contexts vpid and vtid, so')])
+def test_events_without_processes_or_threads_are_said(recorded, graph, nameless, lacks):
+    _, warnings = result_of(recorded.write(nameless=nameless), graph)
+    line, = (each for each in warnings if 'context' in each)
+    assert line.startswith(f'its events lack the {lacks} what ran in several threads is mixed up')
+
+
 def test_jobs_responses_where_the_time_went_and_paths(recorded, graph):
     result, warnings = result_of(recorded.write(), graph)
     assert warnings == []
