@@ -86,6 +86,7 @@ class Awaiting(Generic[JobType]):
         """
         while self._jobs and not is_open(newest := next(reversed(self._jobs))):
             del self._jobs[newest]
+            self._named.pop(newest, None)
         return next(reversed(self._jobs), None)
 
     def named(self, topic: str, stamp: int, otherwise: JobType | None) -> JobType | None:
@@ -138,5 +139,7 @@ class Awaiting(Generic[JobType]):
 
 
 def _forget(several: dict[Any, Any]) -> None:
+    """Forget the oldest ones that are too many; threads that publish may do so at once."""
     if len(several) > MOST_AWAITING:
-        del several[next(iter(several))]
+        for oldest in list(several)[:-MOST_AWAITING]:
+            several.pop(oldest, None)
