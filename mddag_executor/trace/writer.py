@@ -121,7 +121,7 @@ class TraceWriter:
     @property
     def dropped(self) -> int:
         """Return how many recorded events will not be in the file."""
-        late = sum(map(events_of, self._pending)) if self._closed or self.error else 0
+        late = sum(map(events_of, list(self._pending))) if self._closed or self.error else 0
         return self._lost + self._after_end + self._file.rejected + late
 
     def close(self) -> None:
