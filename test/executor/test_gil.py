@@ -10,7 +10,7 @@ import threading
 import time
 from types import SimpleNamespace
 
-from mddag_executor.executor import pausing, publishing
+from mddag_executor.executor import gil, pausing, publishing
 from mddag_executor.executor.compat import function_of_task
 from mddag_executor.executor.pausing import can_pause
 from mddag_executor.executor.work import current
@@ -94,7 +94,8 @@ def test_what_is_learnt_of_callbacks(make_executor, make_node):
         assert wait_for(lambda: found('holds_interpreter') == [False, True], 20.0)
         sleeping, computing = found('interpreter_share')
     sleeps, computes, empty, lent = engine_of(executor).scheduler.state.mean[:4]
-    assert sleeps >= 20 * MS and computes >= 20 * MS
+    # without the time in which it paused for a more urgent one, and checked that
+    assert sleeps >= 20 * MS and computes >= 10 * MS
     assert empty < 20 * MS and lent < 20 * MS
     # on a busy machine it is not known how much it would have computed without the others
     assert computing is None or computing > 0.5
@@ -178,13 +179,16 @@ def computing(request, make_executor, make_node, monkeypatch):
         yield found
 
 
-def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing):
+def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing, monkeypatch):
     """
     The long one does not wait for an urgent one, however long it usually takes.
 
     A patient one never begins before the long one has ended. As no thread is woken for it, it may
     only be taken then; so it must not be overlooked.
     """
+    # on a machine whose CPUs are busy with other programs, the thread that checks gets none for
+    # long while it has the GIL, and a thread that waits for the GIL meanwhile seems to wait
+    monkeypatch.setattr(gil.GilCheck, 'waits', lambda *_: False)
     for _ in range(3):
         assert computing.order('patient') == ['begins', 'ends', 'patient']
     computing.meanwhile = lambda: 'urgent' in computing.ran
