@@ -214,6 +214,17 @@ def test_the_readme_leads_to_every_page():
     assert pages_of_the_site - links == {'index.md'}
 
 
+def test_the_page_of_the_layout_names_files_that_exist():
+    """Those with a folder are there, and the others somewhere."""
+    named = set(re.findall(r'`((?:\w+/)*\w+\.(?:py|txt|yaml))`', (
+        TOP / 'docs' / 'layout.md').read_text(encoding='utf-8')))
+    files = {path.relative_to(TOP).as_posix() for root in ('mddag_executor', 'msg_graph', 'test')
+             for path in (TOP / root).rglob('*')}
+    assert len(named) > 100
+    assert [name for name in sorted(named)
+            if not any(f'/{file}'.endswith(f'/{name}') for file in files)] == []
+
+
 def test_images_and_links():
     texts = {page: (TOP / page).read_text(encoding='utf-8') for page in PAGES}
     for path in (TOP / 'docs' / 'images').iterdir():
