@@ -28,10 +28,12 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU for
     ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
     ``SWITCH_INTERVAL_S``.  It also did if, for a quarter of the time, it was not ready to run and
-    no other thread computed.  The threads that check compute as well, for as long as the shortest
-    interval.  If the thread got no CPU meanwhile, they do not count: it would have got the GIL
-    between two checks, when they gave that away.  Anything else is unclear, and counts only after
-    ``LATELY`` checks, so that the GIL is not withheld from others for ever.
+    no other thread computed, unless the CPUs are busy with other programs: then the thread that
+    has the GIL may not have computed because it waited for a CPU (``BUSY``).  The threads that
+    check compute as well, for as long as the shortest interval.  If the thread got no CPU
+    meanwhile, they do not count: it would have got the GIL between two checks, when they gave that
+    away.  Anything else is unclear, and counts only after ``LATELY`` checks, so that the GIL is
+    not withheld from others for ever.
 """
 
 from __future__ import annotations
@@ -81,6 +83,9 @@ The interval between checks grows from the first to the last; short callbacks us
 The first is shorter if what waits is urgent: this part of ``Interpreter.patience``.  With half of
 it, the successor of a callback that waits after its publication started 0.1 ms later.
 """
+
+BUSY = 10
+"""The CPUs are busy if a thread that is checked was ready for a tenth of the time without one."""
 
 SWITCH_INTERVAL_S = 0.001
 """
@@ -361,7 +366,7 @@ class GilCheck:
                 return True
             others = new.others_since(last)
             delayed = new.schedule.delay_ns - last.schedule.delay_ns
-            if 4 * (passed - others - delayed) >= passed:
+            if BUSY * delayed < passed and 4 * (passed - others - delayed) >= passed:
                 return True
         self._unclear += 1
         return self._unclear >= LATELY

@@ -12,11 +12,19 @@ from mddag_executor.core.jobs import source_depth
 from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
+from mddag_executor.executor import gil
 from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import CHECK_PART, cpu_ns, GilCheck, GilHabit, schedule_of
+from mddag_executor.executor.gil import (
+    CHECK_PART,
+    cpu_ns,
+    GilCheck,
+    GilHabit,
+    Schedule,
+    schedule_of,
+)
 from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest
@@ -586,6 +594,21 @@ def test_the_threads_that_check_do_not_count_as_computing():
     ended.release()
     sleeper.join()
     assert found == [True, False]
+
+
+@pytest.mark.parametrize(('delay', 'waits'), [(0, True), (1, True), (2, False), (12, False)])
+def test_on_a_busy_machine_a_thread_that_waits_for_the_gil_does_not_count_as_waiting(
+    monkeypatch, delay, waits
+):
+    """The thread that has the GIL waits for a CPU, so no thread computes."""
+    schedules = iter((Schedule(0, 10, True), Schedule(delay * MS, 12, True)))
+    monkeypatch.setattr(gil, 'schedule_of', lambda tid: next(schedules))
+    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: 0)
+    monkeypatch.setattr(gil, 'process_time_ns', lambda: 0)
+    check = GilCheck()
+    check.begin(check, 0, 0, MS)
+    assert not check.waits(0, 0, 0)
+    assert check.waits(0, 0, 20 * MS) == waits
 
 
 def test_the_time_of_pauses_does_not_count_as_held():
