@@ -50,7 +50,7 @@ KINDS: dict[str, tuple[Any, ...]] = {
     'ros2:message_construct': (COPY, 'original_message', 'constructed_message'),
     'ros2:rclcpp_ring_buffer_enqueue': (ENQUEUE, 'buffer', 'index', 'overwritten'),
     'ros2:rclcpp_ring_buffer_dequeue': (DEQUEUE, 'buffer', 'index'),
-    'mddag:lost': (LOST, 'count'),
+    'mddag:lost': (LOST, 'count', 'begin'),
 }
 """By full name of an event its kind, and the fields of its columns ``a``, ``b``, …"""
 OWN_KINDS: dict[str, tuple[Any, ...]] = {
@@ -100,6 +100,11 @@ def moved(events: Events, shift: Mapping[int, int]) -> Events:
     table = events.table.copy()
     table['time'] += np.array(
         [shift.get(pid, 0) for pid, _ in events.threads], dtype=np.int64)[table['thread']]
+    # it is not known which clock a gap has: it is in its place by each of them
+    lost, later = table['kind'] == LOST, max(0, *shift.values())
+    table['b'][lost & (table['b'] == 0)] = events.table['time'][lost & (table['b'] == 0)]
+    table['b'][lost] = np.maximum(1, table['b'][lost] + min(0, *shift.values()))
+    table['time'][lost] += later
     table['time'] = np.clip(table['time'], 0, NEVER - 1)
     others = []
     for layout, time, pid, *rest in events.others:

@@ -129,6 +129,8 @@ class Lost(NamedTuple):
     """
     A sign that events are missing.
 
+    :ivar at: the event at which they are missing; of a gap, the first one in it.
+    :ivar time: the latest time of a release of jobs that may have had them.
     :ivar callback: index of the callback that ran for an unknown reason; -1: events were lost.
     :ivar run: its execution if only the end is missing; -1: none.
     """
@@ -174,8 +176,7 @@ class Links:
         self._pid = np.array([pid for pid, _ in events.threads], dtype=np.int64)
         kind = self.events['kind']
         self.discarded = int(self.events['a'][kind == LOST].sum())
-        self._lost = [Lost(at, -1, -1, int(self.events['time'][at]))
-                     for at in np.flatnonzero(kind == LOST).tolist()]
+        self._lost = self._gaps()
         # by thread, then by time
         self._order = sort_by(self.events['thread'])
         self.callbacks, self._callback = self._objects(
@@ -200,6 +201,14 @@ class Links:
         self._find_messages()
         self.takes = self._takes()
         self.lost = np.array(sorted(self._lost), dtype=np.int64).reshape(-1, len(Lost._fields))
+
+    def _gaps(self) -> list[Lost]:
+        """Return the gaps in which events were lost, at their begins."""
+        time, begin = self.events['time'], self.events['b']
+        gaps = np.flatnonzero(self.events['kind'] == LOST)
+        since = np.searchsorted(time, np.where(begin[gaps] != 0, begin[gaps], time[gaps]))
+        return [Lost(min(at, gap), -1, -1, now) for at, gap, now in zip(
+            since.tolist(), gaps.tolist(), time[gaps].tolist())]
 
     def _objects(
         self, events: Mask, known: Addresses[Any],

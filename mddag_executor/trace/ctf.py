@@ -26,7 +26,8 @@ Theory of operation:
    hosts and containers are changed (`numbers`).  An event `mddag:host` precedes the first event of
    a process, if the metadata names its host, and an event `mddag:process` with `procname` the
    first event of a thread, and each change of its name.
-5. Events discarded by the tracer become an event `mddag:lost` at the end of the gap; a lost packet
+5. Events discarded by the tracer become an event `mddag:lost` at the end of the gap, which has the
+   time of its begin: the end of the packet before in the same stream; a lost packet
    counts as at least one event, and a warning reports it.  So does damage.
 6. A tracepoint writes to all sessions that record it before its thread goes on.  So an event that
    equals the one before it in its thread, and that another session recorded, is the same event: it
@@ -486,8 +487,9 @@ class _Importer:
                 self._uncounted += gap.number < 0
                 self.result.discarded += count
         zeros = np.zeros(len(gaps), dtype=np.int64)
+        begins = np.array([max(1, gap.begin) for gap in gaps], dtype=np.int64)
         return Columns(_LOST, order, np.array([gap.time for gap in gaps], dtype=np.int64), zeros,
-                       zeros, [np.minimum(np.array(counts, dtype=np.uint64), 2 ** 62)])
+                       zeros, [np.minimum(np.array(counts, dtype=np.uint64), 2 ** 62), begins])
 
     def _target(self, kind: Kind) -> _Target:
         """Return a kind of event in the trace, which is defined when it is met."""

@@ -192,12 +192,13 @@ class Lost(NamedTuple):
     """
     Events that are missing.
 
-    :ivar time: at the end of the gap.
+    :ivar time: at the end of the gap; ``begin``: at its begin.
     :ivar number: how many; -1: unknown.
     :ivar damage: whether a file is damaged; otherwise the tracer discarded them.
     """
 
     time: int
+    begin: int
     number: int
     damage: bool = False
 
@@ -545,7 +546,9 @@ class Decoder:
         for number, (at, what) in sorted(bad.items()):
             packet, at = packets[number], at - starts[number]
             damages.append(Damage(packet.file, packet.offset + at, what, packet.content - at))
-            lost.append(Lost(self.trace.ns(max(packet.begin, packet.end)), -1, True))
+            begin, end = (self.trace.ns(each) for each in (
+                packet.begin, max(packet.begin, packet.end)))
+            lost.append(Lost(end, begin, -1, True))
         return found
 
 
@@ -863,31 +866,34 @@ class _Stream:
 
     def packets(self, reading: Reading) -> Iterator[Packet]:
         """Yield the packets, in the order of time."""
-        number, discarded, begin = -1, 0, 0
+        number, discarded, begin, end = -1, 0, 0, 0
         for _, file in sorted(self.files):
             size, offset = os.stat(file).st_size, 0
             while offset < size:
                 try:
                     head = read_head(self._trace, file, offset, size)
                 except Damaged as error:
-                    reading.damaged(file, str(error), offset, size)
+                    reading.damaged(file, str(error), offset, size, self._trace.ns(end))
                     break
                 packet = head.packet
                 packet.stream = self._number
                 offset += head.size
+                # what was discarded was not in the packet before
+                since = self._trace.ns(min(end, packet.begin) if number >= 0 else packet.begin)
                 if number >= 0 and 0 <= head.number <= number and packet.begin <= begin:
                     continue        # a snapshot has packets of the one before
                 if 0 <= number < head.number - 1:
-                    reading.lost.append(Lost(self._trace.ns(packet.begin), -1))
+                    reading.lost.append(Lost(self._trace.ns(packet.begin), since, -1))
                 # an empty packet, written when a buffer is flushed, may say 0
                 if head.discarded > discarded:
                     reading.lost.append(Lost(
-                        self._trace.ns(packet.end), head.discarded - discarded))
+                        self._trace.ns(packet.end), since, head.discarded - discarded))
                     discarded = head.discarded
-                number, begin = head.number, packet.begin
+                number, begin, end = head.number, packet.begin, max(packet.begin, packet.end)
                 yield packet
                 if head.is_cut:
-                    reading.damaged(file, 'the file ends within a packet', size, size)
+                    reading.damaged(file, 'the file ends within a packet', size, size,
+                                    self._trace.ns(begin))
 
 
 class Reading:
@@ -902,7 +908,7 @@ class Reading:
     def __init__(self, folders: dict[str, Metadata], raw: bool) -> None:
         self.damages: list[Damage] = []
         self.lost: list[Lost] = []
-        self._until_end = False     # whether events may be missing up to the end
+        self._missing_from: int | None = None       # up to the end; None: nothing is missing
         self._count = 0
         self._streams: dict[Any, _Stream] = {}
         traces: dict[str, Trace] = {}
@@ -925,17 +931,22 @@ class Reading:
             try:
                 head = read_head(trace, entry.path, 0, status.st_size)
             except Damaged as error:
-                self.damaged(entry.path, str(error), 0, status.st_size)
+                self.damaged(entry.path, str(error), 0, status.st_size, 0)
                 continue
             key = (trace.number, entry.path) if head.instance < 0 else (
                 trace.number, id(head.packet.decoder), head.instance)
             stream = self._streams.setdefault(key, _Stream(trace, len(self._streams)))
             stream.files.append((head.packet.begin, entry.path))
 
-    def damaged(self, file: str, what: str, offset: int, size: int) -> None:
-        """Note damage after which nothing of a file is used."""
+    def damaged(self, file: str, what: str, offset: int, size: int, since: int) -> None:
+        """
+        Note damage after which nothing of a file is used.
+
+        :param since: the time up to which it was used, ns.
+        """
         self.damages.append(Damage(file, offset, what, size - offset))
-        self._until_end = True
+        self._missing_from = since if self._missing_from is None else min(
+            since, self._missing_from)
 
     def batches(self) -> Iterator[tuple[Events, list[Lost]]]:
         """Yield events in the order of time, and what is missing up to the last of them."""
@@ -977,8 +988,8 @@ class Reading:
             events = events.picked(order[:ready])
             last = int(events.time[-1]) if len(events) else last
             yield events, self._take_lost(until)
-        if self._until_end:
-            self.lost.append(Lost(last, -1, True))
+        if self._missing_from is not None:
+            self.lost.append(Lost(last, self._missing_from, -1, True))
         if self.lost:
             yield _no_events(), self._take_lost(_NEVER)
 

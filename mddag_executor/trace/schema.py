@@ -173,7 +173,8 @@ _ALL = (
     _event('mddag', 'stop', begin=_I64, end=_I64),
     # the system clock was set forward by so much, which moves timers and stamps
     _event('mddag', 'clock_step', step=_I64),
-    _event('mddag', 'lost', count=_I64),
+    # events that were lost up to now, and since when, 0: unknown
+    _event('mddag', 'lost', (0,), count=_I64, begin=_I64),
     _event('mddag', 'shutdown', end=_I64),
     # imported recordings: the name of the event's thread from here on
     _event('mddag', 'process', procname=_STR),

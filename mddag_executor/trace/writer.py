@@ -77,7 +77,8 @@ class TraceWriter:
         self._lost_lock = threading.RLock()
         self._slice: list[tuple[Any, ...]] = []     # the last slice passed to the file,
         self._given = 0                             # and the number of events before it
-        self._reported_lost = 0         # by `mddag:lost` events so far
+        self._reported_lost = 0         # by `mddag:lost` events so far,
+        self._reported_until = self.now()           # and up to which time
         self._reported_rejection = False
         self._vpid = os.getpid()
         self._stop = threading.Event()
@@ -175,6 +176,7 @@ class TraceWriter:
 
     def _report_losses(self) -> None:
         lost = self._lost + self._file.rejected
+        since, self._reported_until = self._reported_until, self.now()
         if lost == self._reported_lost:
             return
         if self._file.rejection and not self._reported_rejection:
@@ -182,7 +184,8 @@ class TraceWriter:
             _LOGGER.warning('%s: %s', self._file.path, self._file.rejection)
         count = lost - self._reported_lost
         self._reported_lost = lost
-        self._extend([('mddag:lost', self.now(), threading.get_native_id(), count)])
+        self._extend([
+            ('mddag:lost', self._reported_until, threading.get_native_id(), count, since)])
 
     def _extend(self, events: list[tuple[Any, ...]]) -> None:
         self._given = self._file.given

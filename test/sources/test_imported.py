@@ -152,6 +152,18 @@ def test_what_the_tracer_discarded_is_not_held_against_a_job(recorded, graph):
     assert [line for line in warnings if line.startswith('the tracer discarded 50 events')]
 
 
+def test_a_job_that_would_expire_while_events_are_discarded_is_not_judged(recorded, graph):
+    """One CPU discards events for two seconds, and a timer on another one goes on."""
+    recorded.add('mddag:lost', 2500 * MS, 0, 50, BEGIN + 215 * MS)
+    for at in (2000, 3000):
+        recorded.run(PLAN, 5, at * MS, (at + 1) * MS)
+    gap = [place for place, time in enumerate(recorded.times()) if 215 * MS <= time < 1000 * MS]
+    result, _ = result_of(recorded.write(but=gap), graph)
+    camera = result['dags']['/camera']
+    assert (camera['jobs'], camera['ends']['completed'], camera['unjudged']) == (2, 1, 1)
+    assert camera['ends']['expired'] == 0
+
+
 def test_late_and_off_the_grid(tmp_path):
     graph = loads('mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n'
                   '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'graph.yaml')

@@ -275,7 +275,7 @@ def test_a_damaged_file_is_used_up_to_the_damage(tmp_path):
         assert (result.events, len(result.warnings)) == (used, 1), what
         assert re.match(f'{re.escape(str(stream))}: .*{what}', result.warnings[0])
         *_, last = TraceReader(tmp_path / 'out.mcap').events({END[0], 'mddag:lost'}, sorted=True)
-        assert last[0] == 'mddag:lost'
+        assert last[0] == 'mddag:lost' and last[5] - CLOCK_OFFSET <= used
     for damaged in (whole[:30], whole[:24] + b'\0\xff' + whole[26:]):
         stream.write_bytes(damaged)
         with pytest.raises(TraceError, match='s: no event can be read'):
@@ -294,8 +294,9 @@ def test_a_count_of_discarded_events_that_goes_back_is_no_gap(tmp_path):
                      packets=[0, 1, 2, 3], discarded=[2, 5, 0, 7])
     result = import_ctf(folder, tmp_path / 'out.mcap')
     assert result.discarded == 7 and 'discarded 7 events: ' in result.warnings[0]
-    assert [event[4] for event in TraceReader(tmp_path / 'out.mcap').events({'mddag:lost'})] == [
-        2, 3, 2]
+    assert [(event[1] - CLOCK_OFFSET, event[4], event[5] - CLOCK_OFFSET)
+            for event in TraceReader(tmp_path / 'out.mcap').events({'mddag:lost'})] == [
+        (1, 2, 0), (3, 3, 1), (7, 2, 5)]    # since the end of the packet before
 
 
 def test_cut_metadata_is_one_error(tmp_path):
