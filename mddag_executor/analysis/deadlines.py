@@ -465,8 +465,8 @@ class Judged:
             tally.jobs[dag] = int(self._is_judged(self.jobs[dag].release).sum())
             for end, n in Counter(outcome[over].tolist()).items():
                 tally.ends[dag][end] += n
-        tally.add_results(*(self.verdicts[name] for name in (
-            'kind', 'sink', 'job', 'deadline', 'completed')))
+        tally.add_results([tuple(self.verdicts[name] for name in (
+            'kind', 'sink', 'job', 'deadline', 'completed'))])
         demoted = Counter(demotions['vertex'].tolist())
         for v in tally.sinks:
             tally.sinks[v].numbers[SINK_DEMOTED] = demoted[v]

@@ -258,27 +258,45 @@ class Tally:
                 elif is_miss(kind):
                     self._add_miss(vertex, job, deadline, time if kind == SINK_LATE else None)
 
-    def add_results(self, kind: Any, vertex: Any, job: Any, deadline: Any, time: Any) -> None:
-        """Count all results of a run at once: columns of the decisions, as arrays."""
+    def add_results(self, parts: Iterable[tuple[Any, ...]]) -> None:
+        """
+        Count all results of a run at once.
+
+        :param parts: some decisions each, as arrays: kind, vertex, job, deadline, and time.
+        """
         import numpy as np
-        order = np.argsort(vertex, kind='stable')
         sinks = sorted(self.sinks)
-        for v, mine in zip(sinks, np.split(order, np.searchsorted(vertex[order], sinks))[1:]):
-            sink, done = self.sinks[v], mine[kind[mine] <= SINK_LATE]
-            sink.numbers[:JOB_END] = np.bincount(kind[mine], minlength=JOB_END).tolist()
-            responses = np.sort(time[done] - deadline[done] + sink.relative_deadline_ns)
-            if len(responses):
-                sink.shortest, sink.longest = int(responses[0]), int(responses[-1])
-            sink.responses = memoryview(responses)
-            if v in self.windows:
-                for missed in np.sort(job[mine[kind[mine] > SINK_IN_TIME]]).tolist():
-                    self.windows[v].add(missed)
-        misses = np.flatnonzero(kind > SINK_IN_TIME)
-        if len(misses):
-            first = misses[deadline[misses].argmin()]
-            self.first_miss = self._miss(
-                int(vertex[first]), int(job[first]), int(deadline[first]),
-                int(time[first]) if kind[first] == SINK_LATE else None)
+        responses: dict[int, list[Any]] = {v: [np.empty(0, dtype=np.int64)] for v in sinks}
+        missed: dict[int, list[int]] = {v: [] for v in self.windows}
+        for kind, vertex, job, deadline, time in parts:
+            order = np.argsort(vertex, kind='stable')
+            for v, mine in zip(sinks, np.split(order, np.searchsorted(vertex[order], sinks))[1:]):
+                if not len(mine):
+                    continue
+                sink, done = self.sinks[v], mine[kind[mine] <= SINK_LATE]
+                for each, count in enumerate(np.bincount(kind[mine]).tolist()):
+                    sink.numbers[each] += count
+                responses[v].append(time[done] - deadline[done] + sink.relative_deadline_ns)
+                if v in missed:
+                    missed[v] += job[mine[kind[mine] > SINK_IN_TIME]].tolist()
+            misses = np.flatnonzero(kind > SINK_IN_TIME)
+            first = misses[deadline[misses].argmin()] if len(misses) else None
+            if first is not None and (
+                    self.first_miss is None
+                    or deadline[first] < self.first_miss['deadline_ns']):
+                self.first_miss = self._miss(
+                    int(vertex[first]), int(job[first]), int(deadline[first]),
+                    int(time[first]) if kind[first] == SINK_LATE else None)
+        for v, several in responses.items():
+            sink, ordered = self.sinks[v], np.concatenate(several)
+            several.clear()
+            ordered.sort()
+            if len(ordered):
+                sink.shortest, sink.longest = int(ordered[0]), int(ordered[-1])
+            sink.responses = memoryview(ordered)
+        for v, jobs in missed.items():
+            for each in sorted(jobs):
+                self.windows[v].add(each)
 
     def _end_overdue(self, vertex: int, job: int) -> None:
         """Let the verdict of a sink replace its overdue state."""

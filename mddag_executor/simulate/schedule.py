@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mddag_executor import defaults
 from mddag_executor.core import NEVER, Tables, Tally
@@ -126,20 +126,22 @@ class Scheduled(NamedTuple):
         tally.jobs = np.bincount(
             dags[judged].astype(np.int64), minlength=len(tally.jobs)).tolist()
         decisions = np.asarray(self.decisions, dtype=np.int64).reshape(-1, 6)
-        # column by column, or in parts: most rows are chosen, so their copies are large
-        kind, dag, place, _, how, _ = decisions.T
-        results = np.flatnonzero(kind < JOB_END)
-        tally.add_results(
-            kind[results].astype(np.int8), place[results].astype(np.int32),
-            *(decisions[results, column] for column in (3, 4, 5)))
-        del results
-        tally.add(decisions[kind == SINK_DEMOTED].tolist())
+        tally.add_results(_results(decisions))
+        tally.add(decisions[decisions[:, 0] == SINK_DEMOTED].tolist())
         for first in range(0, len(decisions), _PART):
             kind, dag, place, _, how, _ = decisions[first:first + _PART].T
             ends = (kind == JOB_END) & (place != NOT_JUDGED)
             numbers = np.bincount(dag[ends] << 8 | how[ends])
             for pair in np.flatnonzero(numbers).tolist():
                 tally.ends[pair >> 8][pair & 255] += int(numbers[pair])
+
+
+def _results(decisions: Any) -> Iterator[tuple[Any, ...]]:
+    """Yield the results among decisions, in parts: copies of all of them would be large."""
+    for first in range(0, len(decisions), _PART):
+        kind, _, vertex, job, deadline, time = decisions[first:first + _PART].T
+        results = kind < JOB_END
+        yield tuple(column[results] for column in (kind, vertex, job, deadline, time))
 
 
 def schedule(
