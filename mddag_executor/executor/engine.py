@@ -192,6 +192,7 @@ class Engine:
         """Handle a timer that became due at ``due``."""
         entity = work.entity
         if entity.removed or self._finished:
+            entity.leave([work])
             return
         release = max(entity.since, min(due, now))
         if entity.depth and len(entity.waiting) >= entity.depth:
@@ -242,6 +243,7 @@ class Engine:
             self.ready(work, now)
             return
         if entity.removed or self._finished:
+            entity.leave([work])
             return
         if entity.source >= 0:
             self._start_job(work, max(entity.since, min(release, now)), now)
@@ -263,6 +265,7 @@ class Engine:
         """Handle undeclared work: a message, request, guard condition, waitable or task."""
         entity = work.entity
         if entity.removed or self._finished:
+            entity.leave([work])
             if not self._finished:  # a waitable's data are taken without the engine's lock
                 entity.ready += 1
                 self.verdicts.dropped(entity, NO_ORIGIN, 'destroyed', now)
@@ -428,14 +431,19 @@ class Engine:
             self._drop(entity, x, 'qos_depth', now)
 
     def remove(self, entity: Entity, now: int) -> None:
-        """Forget a destroyed entity: its waiting executions never run."""
+        """Forget a removed entity: its waiting executions do not run here any more."""
         entity.removed = entity.may_be_gone = True
         self._end_bypass()
+        self.leave_waiting(entity)
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
         if entity.queue >= 0:
             self.scheduler.free_queue(entity.queue)
             entity.queue = -1
+
+    def leave_waiting(self, entity: Entity) -> None:
+        """Leave the waiting executions of an entity to the next executor of its node, if any."""
+        entity.leave([self._work[x] for x in entity.waiting])
 
     # --- dispatch --------------------------------------------------------------------------------
 
@@ -781,6 +789,7 @@ class Engine:
         self._end_bypass()
         entity, x = work.entity, work.x
         if entity.removed:
+            entity.leave([work])
             self.destroyed(work, now)
             return
         self._let_go(work)

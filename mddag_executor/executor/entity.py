@@ -152,6 +152,9 @@ class Entity(ChannelSource):
         """Return whether messages may come that declared callbacks of this process do not send."""
         return False
 
+    def leave(self, several: list[Any]) -> None:
+        """Leave executions that will not run here to the next executor of its node, if any."""
+
     def record(self, say: Callable_[..., None], node: int) -> None:
         """
         Record it, with the tracepoints that CARET expects if it knows the kind.

@@ -299,8 +299,9 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Stop running a node's callbacks; another executor may run them then.
 
-        Its collected messages that have not run yet are dropped and counted: without a spin, not
-        before the next spin, because the node may have been added again (``rclpy.spin_once``).
+        The next executor of the node runs what was collected but has not run yet, if it is a
+        ``MultiDeadlineExecutor``; here, this counts as dropped: without a spin, not before the
+        next spin, because the node may have been added again (``rclpy.spin_once``).
         """
         super().remove_node(node)
         self._upkeep.change()

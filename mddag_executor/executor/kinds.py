@@ -29,10 +29,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
+from mddag_executor.executor.compat import alive
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.hall import Hall, Timers
 from mddag_executor.executor.listeners import clear_listener, ListenerError, set_listener
 from mddag_executor.executor.loop import EventLoop
+from mddag_executor.executor.transfers import transfer_of
 from rclpy.exceptions import InvalidHandle
 
 
@@ -48,6 +50,9 @@ class AtOnceHall(Protocol):
 
     def count(self, entity: Entity) -> None:
         """Count a callback that has run."""
+
+    def ring(self) -> None:
+        """End the current wait, or the next one."""
 
 
 class Group(Protocol):
@@ -117,6 +122,11 @@ class Kind(Entity):
 
     def collect(self) -> None:
         """Collect the arrivals."""
+
+    def leave(self, several: list[Any]) -> None:
+        """Leave executions that will not run here to the next executor of its node, if any."""
+        if several and alive(self.rclpy_object):
+            transfer_of(self.rclpy_object).leave(several)
 
 
 class ListenerEntity(Kind):

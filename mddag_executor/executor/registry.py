@@ -150,7 +150,8 @@ class Registry:
             for list_name, some in zip(LISTS, lists):
                 for rclpy_object in some:
                     entity = self.by_id.get(id(rclpy_object))
-                    if entity is None or entity.rclpy_object is not rclpy_object:
+                    if entity is None or entity.removed or (
+                            entity.rclpy_object is not rclpy_object):
                         new.append((list_name, rclpy_object, name, outer))
                     else:
                         present[id(rclpy_object)] = entity

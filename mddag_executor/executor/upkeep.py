@@ -23,12 +23,14 @@ from mddag_executor.executor.at_once import AtOnce
 from mddag_executor.executor.compat import alive, publisher_ids
 from mddag_executor.executor.kinds import Kind, Rooms
 from mddag_executor.executor.registry import Registry, snapshot
+from mddag_executor.executor.transfers import transfer_of
 from mddag_executor.executor.waitables import (
     EventsSource,
     SharedSource,
     WaitableEntity,
     WaitSetThread,
 )
+from mddag_executor.executor.work import Work
 from mddag_executor.executor.workers import WorkerPool
 from rclpy.exceptions import InvalidHandle
 
@@ -58,6 +60,8 @@ class Upkeep:
         self._refresh_at = 0.0
         # entities without listener which the next refresh may find again
         self._silent: list[Kind] = []
+        # whether executions were left for entities that listen already (``transfers``)
+        self._has_left = False
 
     def change(self) -> None:
         """Note that entities may have been created or destroyed."""
@@ -108,8 +112,14 @@ class Upkeep:
         for entity in gone:
             self._ignore(entity)
         for entity in (*added, *back):
+            transfer_of(entity.rclpy_object).claim(self, entity.rclpy_object)
+            self._run_left(entity)  # first: later messages come after them
             self._listen(entity)
         self._apply()
+        if self._has_left:
+            self._has_left = False
+            for entity in list(registry.by_id.values()):
+                self._run_left(entity)
         with pool.lock:
             pool.due.arm_for_new(time.monotonic_ns())
             if moved:
@@ -119,6 +129,32 @@ class Upkeep:
         """Return the ids of the publishers of a subscription, None if they are unknown."""
         nodes = (node for each in self._living if (node := each()) is not None and alive(node))
         return next((publisher_ids(node, subscription) for node in nodes), None)
+
+    # --- executions of other executors (``transfers``) -------------------------------------------
+
+    def _run_left(self, entity: Kind) -> None:
+        """Make those executions ready that another executor has left."""
+        left = transfer_of(entity.rclpy_object).left
+        while left:
+            before = left.popleft()
+            work = Work(entity, before.function, before.args, before.then)
+            self._pool.report(partial(self._arrived, work))
+
+    def _arrived(self, work: Work, now: int) -> None:
+        self._pool.engine.arrived(work, None, now, -1, now)
+
+    def give_up(self, rclpy_object: Any) -> None:
+        """Leave the executions of an object whose node was removed while nothing spun."""
+        with self._pool.lock:
+            entity = self._registry.by_id.get(id(rclpy_object))
+            if entity is not None and not entity.removed:
+                self._pool.engine.remove(entity, self._pool.tick())
+
+    def note_left(self) -> None:
+        """Note that executions were left for one of its objects; from any thread."""
+        self._has_left = True
+        self.change()
+        self._rooms.at_once.ring()
 
     # --- sources ---------------------------------------------------------------------------------
 
@@ -152,4 +188,6 @@ class Upkeep:
         with self._lock:
             for entity in self._registry.by_id.values():
                 self._ignore(entity)
+                with self._pool.lock:
+                    self._pool.engine.leave_waiting(entity)
             self._apply()

@@ -294,3 +294,81 @@ def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_cont
                 thing() for thing in left if thing() is not None]
     finally:
         gc.enable()
+
+
+# --- nodes that move -----------------------------------------------------------------------------
+
+class Moving:
+    """A node with all kinds of arrivals, some of which an executor has collected but not run."""
+
+    def __init__(self, make_node):
+        self.heard, self.node, other = [], make_node('moving'), make_node('other')
+        self.node.create_subscription(
+            Header, '/moved', lambda m: self.heard.append(m.stamp.sec), 10)
+        self.node.create_service(Trigger, '/moved/ask', answer)
+        self.guard = self.node.create_guard_condition(lambda: self.heard.append(-1))
+        self.publisher = other.create_publisher(Header, '/moved', 10)
+        self.client = other.create_client(Trigger, '/moved/ask')
+        self.other, self.answers = other, []
+        matched(self.publisher)
+        assert wait_for(self.client.service_is_ready)
+
+    def send(self):
+        for number in range(3):
+            message = Header()
+            message.stamp.sec = number
+            self.publisher.publish(message)
+        self.client.call_async(Trigger.Request()).add_done_callback(self.answers.append)
+        self.guard.trigger()
+
+    def has_all(self):
+        return sorted(self.heard) == [-1, 0, 1, 2] and len(self.answers) == 1
+
+
+def waiting(executor):
+    return sum(each['waiting'] for each in executor.statistics()['callbacks'].values())
+
+
+@pytest.mark.parametrize('shuts_down', [False, True])
+def test_what_waits_moves_with_its_node(make_executor, make_node, shuts_down):
+    """With executors of rclpy, messages wait in the middleware until their callbacks run."""
+    moving = Moving(make_node)
+    has_begun, go_on = threading.Event(), threading.Event()
+
+    def wait():
+        has_begun.set()
+        go_on.wait(30.0)
+
+    guard = moving.node.create_guard_condition(wait)  # in the callback group of all others
+    before = make_executor(num_workers=2, nodes=[moving.node])
+    after = make_executor(nodes=[moving.other])
+    with Spinning(after):
+        with Spinning(before):
+            guard.trigger()
+            assert has_begun.wait(15.0)
+            moving.send()
+            assert wait_for(lambda: waiting(before) == 5)
+            if shuts_down:
+                before.shutdown(0.0)
+            after.add_node(moving.node)
+            go_on.set()
+            assert wait_for(moving.has_all)
+    assert [each for each in moving.heard if each >= 0] == [0, 1, 2]
+
+
+@pytest.mark.parametrize('comes_back', [False, True])
+def test_what_a_spin_once_has_not_run_moves_with_its_node(make_executor, make_node, comes_back):
+    moving = Moving(make_node)
+    before, after = make_executor(nodes=[moving.node]), make_executor(nodes=[moving.other])
+    with Spinning(after):
+        before.spin_once(timeout_sec=0.0)
+        moving.send()
+        assert wait_for(lambda: before.spin_once(timeout_sec=0.1) or waiting(before) > 1)
+        before.remove_node(moving.node)
+        if comes_back:
+            before.add_node(moving.node)
+            assert wait_for(lambda: before.spin_once(timeout_sec=0.01) or moving.has_all())
+        else:
+            after.add_node(moving.node)
+            assert wait_for(moving.has_all)
+    assert [each for each in moving.heard if each >= 0] == [0, 1, 2]
