@@ -14,8 +14,8 @@ from mddag_executor.core.jobs import next_deadline
 from mddag_executor.core.queues import first_of, has_place
 from mddag_executor.core.state import (
     ALONE,
+    DEFERRED,
     FREE,
-    HELD_BACK,
     N_HOLDING,
     N_IDLE,
     OPEN,
@@ -56,7 +56,7 @@ def broken_in_core(t: Tables, s: State) -> Iterator[str]:
 
 def _all_heaps(s: State) -> Iterator[tuple[str, int, list[QueueEntry]]]:
     yield 'the ready heap', READY, s.ready
-    yield 'the heap of deferred entries', HELD_BACK, s.held_back
+    yield 'the heap of deferred entries', DEFERRED, s.deferred
     for group, heap in enumerate(s.group_heap):
         yield f'the heap of group {group}', group, heap
     for outer, heap in enumerate(s.outer_heap):
@@ -137,7 +137,7 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
             yield (f'group {group} is owned by execution {owner}, which has group '
                    f'{s.x_group[owner]} and state {s.x_state[owner]}')
     coming = {s.x_group[first_of(s, entry)] for entry in (
-        *s.ready, *s.held_back, *(entry for heap in s.outer_heap for entry in heap))}
+        *s.ready, *s.deferred, *(entry for heap in s.outer_heap for entry in heap))}
     for group, heap in enumerate(s.group_heap):
         waiting = [first_of(s, entry) for entry in heap]
         if waiting and s.group_owner[group] < 0 and group not in coming:
@@ -148,7 +148,7 @@ def _groups(t: Tables, s: State) -> Iterator[str]:
 
 
 def _outer_groups(s: State) -> Iterator[str]:
-    coming = {s.x_outer[first_of(s, entry)] for entry in (*s.ready, *s.held_back)}
+    coming = {s.x_outer[first_of(s, entry)] for entry in (*s.ready, *s.deferred)}
     for x, place in enumerate(s.x_place):
         if place == RETURNS and s.x_outer[x] < 0:
             yield f'execution {x} asks for a place of an outer group, and has none'

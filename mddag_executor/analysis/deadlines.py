@@ -59,8 +59,8 @@ from mddag_executor.core.tables import DRIVEN
 from mddag_executor.memory import give_back
 from mddag_executor.recording import tables as recorded
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
-from mddag_executor.recording.jobs import Jobs
 from mddag_executor.recording.joins import different, distinct, rows_by, sort_by
+from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.recording import Recording
 from mddag_executor.text import counted
 from msg_graph.model import optional_edges, topological_order

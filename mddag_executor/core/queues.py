@@ -27,7 +27,7 @@ Each entry is in exactly one of these heaps:
 first;
 * the heap of an outer group (``State.outer_heap``), if the outer group had no place when the entry
 came first;
-* the heap of deferred entries (``State.held_back``), if an execution that is as urgent held the
+* the heap of deferred entries (``State.deferred``), if an execution that is as urgent held the
 interpreter when the entry came first.
 
 An entry whose key changes is replaced in its heap, so no heap has an outdated entry.  Nearly
@@ -40,7 +40,7 @@ from heapq import heapify, heappop, heappush
 
 from mddag_executor.core.state import (
     ALONE,
-    HELD_BACK,
+    DEFERRED,
     N_HOLDING,
     NO_PLACE,
     OUTER,
@@ -114,7 +114,7 @@ def unlink(s: State, x: int) -> None:
     """Take a waiting execution out of its queue, or away with its entry."""
     if s.x_state[x] == ALONE:
         remove(s.ready, ~x)
-        remove(s.held_back, ~x)
+        remove(s.deferred, ~x)
         if s.x_group[x] >= 0:
             remove(s.group_heap[s.x_group[x]], ~x)
         if s.x_outer[x] >= 0:
@@ -139,7 +139,7 @@ def heap_at(s: State, place: int) -> list[QueueEntry]:
         return s.group_heap[place]
     if place <= OUTER:
         return s.outer_heap[OUTER - place]
-    return s.held_back if place == HELD_BACK else s.ready
+    return s.deferred if place == DEFERRED else s.ready
 
 
 def change_key(s: State, queue: int, entry: QueueEntry) -> None:
@@ -253,16 +253,16 @@ def next_heap(s: State) -> list[QueueEntry]:
 
     A deferred execution counts once it may start (rule 10).
     """
-    if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
+    if len(s.deferred) == 0 or (len(s.ready) > 0 and s.ready[0] < s.deferred[0]):
         return s.ready
-    return s.held_back if may_start(s, s.held_back[0]) else s.ready
+    return s.deferred if may_start(s, s.deferred[0]) else s.ready
 
 
 def defer(s: State, heap: list[QueueEntry], deferred: list[QueueEntry]) -> None:
     """Move the first entry of a heap to the heap of deferred ones."""
     entry = heappop(heap)
     if entry[4] >= 0:
-        s.queue_place[entry[4]] = HELD_BACK
+        s.queue_place[entry[4]] = DEFERRED
     heappush(deferred, entry)
 
 
@@ -280,11 +280,11 @@ def may_start(s: State, entry: QueueEntry) -> bool:
 
 def first_waiting(s: State) -> int:
     """Return the first waiting execution; -1: there is none."""
-    if len(s.ready) == 0 and len(s.held_back) == 0:
+    if len(s.ready) == 0 and len(s.deferred) == 0:
         return -1
-    if len(s.held_back) == 0 or (len(s.ready) > 0 and s.ready[0] < s.held_back[0]):
+    if len(s.deferred) == 0 or (len(s.ready) > 0 and s.ready[0] < s.deferred[0]):
         return first_of(s, s.ready[0])
-    return first_of(s, s.held_back[0])
+    return first_of(s, s.deferred[0])
 
 
 def overtaking_pays(

@@ -87,7 +87,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
 10. **The interpreter.**  Python's lock lets one thread compute at a time.  An execution that holds
     the interpreter (reported by the driver, ``State.x_holds``) starts only if no running execution
     with the same or a smaller priority holds it.  Until then its queue is deferred
-    (``State.held_back``), and others overtake it.  If it is more urgent than all holders, it
+    (``State.deferred``), and others overtake it.  If it is more urgent than all holders, it
     starts, unless the driver forbids it for the moment (``State.overtaking``, from
     ``queues.overtaking_pays``: the wait is short).  In a live run, the overtaken executions pause,
     or share the interpreter with it.  An execution that lends its worker, is suspended or turns
@@ -312,7 +312,7 @@ def peek(t: Tables, s: State, now: int) -> int:
     queues are demoted (rule 7).
     """
     heap = s.ready
-    if s.held_back:
+    if s.deferred:
         heap = next_heap(s)
     while heap:
         entry = heap[0]
@@ -334,7 +334,7 @@ def peek(t: Tables, s: State, now: int) -> int:
             let_group(s, x)  # others of the group may go first
             _let_others(s, x)
         elif s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0 and not may_start(s, entry):
-            defer(s, heap, s.held_back)
+            defer(s, heap, s.deferred)
             let_group(s, x)
             _let_others(s, x)
         else:
@@ -386,7 +386,7 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     x = peek(t, s, now)
     if x < 0:
         return -1
-    entry = _pop_first(s, x) if s.held_back else heappop(s.ready)
+    entry = _pop_first(s, x) if s.deferred else heappop(s.ready)
     s.x_key[x] = entry
     queue = entry[4]
     if queue >= 0:
@@ -415,7 +415,7 @@ def _pop_first(s: State, x: int) -> QueueEntry:
     """Remove and return the entry of an execution, first of those that are ready or deferred."""
     if s.ready and first_of(s, s.ready[0]) == x:
         return heappop(s.ready)
-    entry = heappop(s.held_back)
+    entry = heappop(s.deferred)
     if entry[4] >= 0:
         s.queue_place[entry[4]] = READY
     return entry

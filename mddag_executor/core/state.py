@@ -35,7 +35,7 @@ ELSEWHERE, HERE, LEADS_OUT = range(3)
  N_SCALARS) = range(10)
 
 # Where the entry of a queue is (``queue_place``), if not in the heap of a callback group.
-READY, HELD_BACK = -1, -2
+READY, DEFERRED = -1, -2
 OUTER = -3  # the first outer group, the next one is -4, …
 
 # Which times the keys of a policy are (``URGENCY``): none, deadlines of sinks, latest starts for
@@ -70,7 +70,7 @@ class State(NamedTuple):
     # those that may come first, those that are deferred for the interpreter, and for each callback
     # group those that wait for it
     ready: list[QueueEntry]
-    held_back: list[QueueEntry]
+    deferred: list[QueueEntry]
     group_heap: list[list[QueueEntry]]
     group_owner: list[int]
     # by outer group: a heap of what waits for a place in it, how many may run at a time, how many

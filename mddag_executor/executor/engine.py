@@ -147,7 +147,7 @@ class Engine:
         self._state = self.scheduler.state
         self._bypass = Bypass()
         self._may_bypass = False
-        self._ready, self._held_back = self._state.ready, self._state.held_back
+        self._ready, self._deferred = self._state.ready, self._state.deferred
         self._scalars = self._state.scalars
         self._make_ready = self.scheduler.ready
         self._complete = self.scheduler.complete
@@ -475,7 +475,7 @@ class Engine:
         :param others_wait: whether a thread waits for events, which can start more at once.
         """
         step, bypass = self._step, self._bypass
-        if not (self._ready or self._held_back or bypass.queue):  # nearly every second time
+        if not (self._ready or self._deferred or bypass.queue):  # nearly every second time
             step.work = None
             step.more = False
             step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
@@ -488,7 +488,7 @@ class Engine:
             holders = self._holders
             step.overtaken = holders[-2] if (
                 len(holders) > 1 and holders[-1] is work and self.interpreter.pauses) else None
-        if self._ready or self._held_back or bypass.queue:
+        if self._ready or self._deferred or bypass.queue:
             step.patience_ns = self.interpreter.patience()
             step.more = (others_wait or not is_short) and self._may_start_more(now)
         else:
@@ -516,7 +516,7 @@ class Engine:
         """
         if self.idle_workers < 1:
             return NEVER
-        waits = self._ready or self._held_back or self._bypass.queue
+        waits = self._ready or self._deferred or self._bypass.queue
         patience = self.interpreter.patience() if waits else NET_NS
         # it is not known yet whether a holder really computes: half the time
         return patience // 2 if self._holders else patience

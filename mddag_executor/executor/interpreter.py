@@ -98,13 +98,13 @@ class Interpreter:
         state = self._state
         if not state.scalars[N_IDLE] or not has_waiting(state):
             return False
-        ready, held_back = state.ready, state.held_back
+        ready, deferred = state.ready, state.deferred
         is_held = bool(self.holders)
-        if len(ready) > MOST or held_back and not is_held:
+        if len(ready) > MOST or deferred and not is_held:
             return True
         x_holds, x_group, owners = state.x_holds, state.x_group, state.group_owner
         has_outer = bool(state.outer_limit)
-        first = held_back[0] if held_back else None
+        first = deferred[0] if deferred else None
         for entry in ready:
             x = first_of(state, entry)
             group = x_group[x]
@@ -122,4 +122,4 @@ class Interpreter:
 
 def has_waiting(state: State) -> bool:
     """Return whether any execution waits in the core, except for its callback group."""
-    return bool(state.ready or state.held_back)
+    return bool(state.ready or state.deferred)

@@ -48,7 +48,7 @@ class OuterPlaces:
         return any(
             state.x_outer[first_of(state, entry)] == outer and has_place(
                 state, first_of(state, entry))
-            for heap in (state.ready, state.held_back) for entry in heap)
+            for heap in (state.ready, state.deferred) for entry in heap)
 
     def is_open(self, outer: int) -> bool:
         """Return whether executions of it may start, and will still when one has started."""

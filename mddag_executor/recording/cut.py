@@ -19,8 +19,8 @@ Theory of operation
 from __future__ import annotations
 
 from mddag_executor.recording.columns import Mask, Places
-from mddag_executor.recording.jobs import Jobs
 from mddag_executor.recording.joins import RowNumbers
+from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import Columns, VERTEX
 from msg_graph.model import topological_order

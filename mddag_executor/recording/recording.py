@@ -13,10 +13,10 @@ from mddag_executor.core import NEVER
 from mddag_executor.recording import cut, frames
 from mddag_executor.recording.columns import Ints, Places, Table
 from mddag_executor.recording.head import ReplayError
-from mddag_executor.recording.jobs import Jobs
 from mddag_executor.recording.joins import different
 from mddag_executor.recording.losses import Losses
 from mddag_executor.recording.names import Names
+from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import Columns, UNKNOWN, WITHDRAWN
 from msg_graph import TaskSet

@@ -22,9 +22,11 @@ import ctypes
 from functools import cache
 import hashlib
 from importlib.util import find_spec
+import math
 import os
 from pathlib import Path
 import platform
+import time
 from typing import Any
 import weakref
 
@@ -44,6 +46,7 @@ import numpy.typing as npt
 _COMPILE_S = 4.0    # approximate compile time
 _REPEATS = 4        # assumed repetitions of such work, as with other settings
 _STORED = 8         # kept versions of the code
+_WRITTEN_BY_S = 3600.0   # a file that was not renamed after this time never is
 
 _MANY = 100_000
 """More elements are not copied."""
@@ -101,15 +104,29 @@ def _stored_code() -> bytes | None:
 
 
 def _store(code: bytes) -> None:
-    """Store machine code; of older versions only the newest ones remain."""
+    """
+    Store machine code; of older versions only the newest ones remain.
+
+    Other processes may do the same: a file that one of them reads stays readable for it.
+    """
     path = _path()
     path.parent.mkdir(parents=True, exist_ok=True)
     written = path.with_suffix(f'.{os.getpid()}.part')
     written.write_bytes(hashlib.sha256(code).digest() + code)
     written.replace(path)
-    found = sorted(path.parent.glob('core-*.bin'), key=lambda each: each.stat().st_mtime)
-    for old in found[:-_STORED]:
+    stored = sorted(path.parent.glob('core-*.bin'), key=_age_s, reverse=True)
+    # a process that was killed has left its file
+    abandoned = [each for each in path.parent.glob('core-*.part') if _age_s(each) > _WRITTEN_BY_S]
+    for old in (*stored[:-_STORED], *abandoned):
         old.unlink(missing_ok=True)
+
+
+def _age_s(path: Path) -> float:
+    """Return how long ago a file was written, s; for ever, if another process has removed it."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except FileNotFoundError:
+        return math.inf
 
 
 def check_available() -> None:

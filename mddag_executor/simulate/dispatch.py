@@ -101,25 +101,25 @@ def _take_of_several(t: Tables, s: State, p: Pool, now: int) -> int:
     if x >= 0:
         x = take(t, s, worker, now)
     for i in range(len(p.aside)):
-        s.held_back.append(p.aside[i])
+        s.deferred.append(p.aside[i])
     p.aside.clear()
-    heapify(s.held_back)
+    heapify(s.deferred)
     return x
 
 
 def _bring_forward(s: State, p: Pool) -> None:
     """Move the deferred executions that may start now into the ready heap."""
     kept = 0
-    for i in range(len(s.held_back)):
-        entry = s.held_back[i]
+    for i in range(len(s.deferred)):
+        entry = s.deferred[i]
         process = s.process[s.x_vertex[first_of(s, entry)]]
         if may_start(s, entry) and idle_worker(s, p, process) >= 0:
             come_forward(s, entry)
         else:
-            s.held_back[kept] = entry
+            s.deferred[kept] = entry
             kept += 1
-    del s.held_back[kept:]
+    del s.deferred[kept:]
     # the core does not look at these: it knows of the interpreter only
     for i in range(kept):
-        p.aside.append(s.held_back[i])
-    s.held_back.clear()
+        p.aside.append(s.deferred[i])
+    s.deferred.clear()

@@ -114,7 +114,7 @@ def first_to_run(s: State, p: Pool, process: int) -> int:
     first = -1
     smallest = (NEVER, 0, 0, 0, 0)
     several = len(p.process) > 0 or p.scalars[POLLING] != 0
-    for heap in (s.ready, s.held_back):
+    for heap in (s.ready, s.deferred):
         for i in range(len(heap) if several else min(1, len(heap))):
             if heap[i] < smallest and in_round(p, heap[i]):
                 x = first_of(s, heap[i])

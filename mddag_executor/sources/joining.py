@@ -39,9 +39,9 @@ from mddag_executor.core import NEVER
 from mddag_executor.errors import UsageError
 from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.head import Head, is_declared, ReplayError
-from mddag_executor.recording.jobs import Jobs
 from mddag_executor.recording.joins import different, groups, RowNumbers, sort_by
 from mddag_executor.recording.losses import Loss, Losses
+from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import ALL_LEGS, Columns, NOTHING, TABLES, UNKNOWN

@@ -787,7 +787,7 @@ def set_key(engine, queue):
 
 
 BREAKS = {
-    'lost entry': ('those in a heap', lambda e: e._state.held_back.pop()),
+    'lost entry': ('those in a heap', lambda e: e._state.deferred.pop()),
     'two entries': ('a second entry', lambda e: e._state.ready.append(e._state.ready[0])),
     'wrong place': ('which says', lambda e: set_queue(e, 'queue_place', lambda s, q: 7)),
     'wrong key': ('which says', lambda e: set_queue(e, 'queue_key', lambda s, q: (0,) * 5)),

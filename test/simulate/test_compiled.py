@@ -209,8 +209,12 @@ def test_only_the_newest_versions_remain(tmp_path, monkeypatch):
         old = folder / f'core-{number:02}.bin'
         old.touch()
         os.utime(old, (number, number))
+    (folder / 'core-gone.bin').symlink_to('missing')  # just removed by another process
+    for name in ('core-old.1.part', 'core-new.2.part'):
+        (folder / name).touch()
+    os.utime(folder / 'core-old.1.part', (0, 0))
     monkeypatch.setattr(compiled, '_path', lambda: folder / 'core-new.bin')
     compiled._store(b'code')
     assert sorted(path.name for path in folder.iterdir()) == [
-        *(f'core-{number}.bin' for number in range(13, 20)), 'core-new.bin']
+        *(f'core-{number}.bin' for number in range(13, 20)), 'core-new.2.part', 'core-new.bin']
     assert compiled._stored_code() == b'code'

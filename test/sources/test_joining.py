@@ -9,7 +9,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
 from mddag_executor.recording.columns import rows
-from mddag_executor.recording.jobs import Jobs
+from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.tables import RELEASES
 from mddag_executor.sources.clocks import offsets
 from mddag_executor.trace import TraceFile
