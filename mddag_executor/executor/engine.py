@@ -432,8 +432,7 @@ class Engine:
 
     def remove(self, entity: Entity, now: int) -> None:
         """Forget a removed entity: its waiting executions do not run here any more."""
-        entity.removed = entity.may_be_gone = True
-        self._end_bypass()
+        entity.may_be_gone = True
         self.leave_waiting(entity)
         for x in list(entity.waiting):
             self._drop(entity, x, 'destroyed', now)
@@ -442,7 +441,13 @@ class Engine:
             entity.queue = -1
 
     def leave_waiting(self, entity: Entity) -> None:
-        """Leave the waiting executions of an entity to the next executor of its node, if any."""
+        """
+        Leave the waiting executions of an entity to the next executor of its node, if any.
+
+        Later ones are left as well.
+        """
+        self._end_bypass()
+        entity.removed = True
         entity.leave([self._work[x] for x in entity.waiting])
 
     # --- dispatch --------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import matched, Spinning, wait_for
+from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import graph
 from .inside import pool_of, registry_of
 
@@ -353,22 +353,27 @@ def test_what_waits_moves_with_its_node(make_executor, make_node, shuts_down):
             after.add_node(moving.node)
             go_on.set()
             assert wait_for(moving.has_all)
-    assert [each for each in moving.heard if each >= 0] == [0, 1, 2]
+            assert wait_for(lambda: is_idle(after))
+    assert moving.has_all() and [each for each in moving.heard if each >= 0] == [0, 1, 2]
 
 
-@pytest.mark.parametrize('comes_back', [False, True])
-def test_what_a_spin_once_has_not_run_moves_with_its_node(make_executor, make_node, comes_back):
+@pytest.mark.parametrize('then', ['moves', 'comes_back', 'shuts_down'])
+def test_what_a_spin_once_has_not_run_moves_with_its_node(make_executor, make_node, then):
     moving = Moving(make_node)
     before, after = make_executor(nodes=[moving.node]), make_executor(nodes=[moving.other])
     with Spinning(after):
         before.spin_once(timeout_sec=0.0)
         moving.send()
         assert wait_for(lambda: before.spin_once(timeout_sec=0.1) or waiting(before) > 1)
-        before.remove_node(moving.node)
-        if comes_back:
+        if then == 'shuts_down':
+            before.shutdown()
+        else:
+            before.remove_node(moving.node)
+        if then == 'comes_back':
             before.add_node(moving.node)
             assert wait_for(lambda: before.spin_once(timeout_sec=0.01) or moving.has_all())
         else:
             after.add_node(moving.node)
             assert wait_for(moving.has_all)
-    assert [each for each in moving.heard if each >= 0] == [0, 1, 2]
+            assert wait_for(lambda: is_idle(after))
+    assert moving.has_all() and [each for each in moving.heard if each >= 0] == [0, 1, 2]
