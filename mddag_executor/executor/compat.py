@@ -14,7 +14,7 @@ Two adapters are separate modules: ``listeners`` (``handle.pointer``) and ``wait
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import partial
 import inspect
 from operator import attrgetter
@@ -29,6 +29,7 @@ import rclpy.client
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import Executor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.task import Future, Task
 from rclpy.time_source import TimeSource
@@ -334,23 +335,44 @@ def cancel_running(task: Any) -> None:
     Future.cancel(task)
 
 
-def function_of_task(callback: Any, args: tuple[Any, ...]) -> object:
+def user_function(callback: Any, args: tuple[Any, ...]) -> tuple[Any, Any]:
     """
-    Return what a task's function has in common with others that do the same: its code.
+    Return what a task calls, and the object whose method it is, or None.
 
-    An action server runs each goal in a task of its method ``_execute_goal``: then it is the code
-    of the goal's callback.
+    An action server runs each goal in a task of its method ``_execute_goal``: then it is the
+    goal's callback, of the server.
     """
     while isinstance(callback, partial):
         callback, args = callback.func, (*callback.args, *args)
+    function = getattr(callback, '__func__', callback)
+    owner = getattr(callback, '__self__', None)
+    if getattr(function, '__qualname__', '') == 'ActionServer._execute_goal' and args:
+        return user_function(args[0], ())[0], owner
+    return callback, owner
+
+
+def function_of_task(callback: Any, args: tuple[Any, ...]) -> object:
+    """Return what a task's function has in common with others that do the same: its code."""
+    callback, _ = user_function(callback, args)
     if inspect.iscoroutine(callback):
         return callback.cr_code
     function = getattr(callback, '__func__', callback)
-    name = getattr(function, '__qualname__', '')
-    if name == 'ActionServer._execute_goal' and args:
-        return function_of_task(args[0], ())
     code: object = getattr(function, '__code__', None)
-    return (type(callback), name) if code is None else code
+    return (type(callback), getattr(function, '__qualname__', '')) if code is None else code
+
+
+def name_of_task(callback: Any, args: tuple[Any, ...]) -> tuple[str, str]:
+    """Return the node of a task's function, and module and name; empty: it has none."""
+    callback, owner = user_function(callback, args)
+    name = getattr(callback, '__qualname__', type(callback).__qualname__)
+    frame = getattr(callback, 'cr_frame', None)  # of a coroutine
+    module = getattr(callback, '__module__', None) or (
+        '' if frame is None else frame.f_globals.get('__name__', ''))
+    node = owner if isinstance(owner, Node) else getattr(owner, '_node', None)  # of an action
+    with suppress(InvalidHandle):  # it is destroyed
+        if isinstance(node, Node):
+            return str(node.get_fully_qualified_name()), f'{module}.{name}'
+    return '', f'{module}.{name}'
 
 
 def forget_task_frames(error: BaseException) -> None:

@@ -228,9 +228,7 @@ class MultiDeadlineExecutor(BareExecutor):
         self._registry = Registry(
             task_set, self._engine, self._pool.leave_group, self._recorder)
         self._new_tasks: deque[Work] = deque()
-        self._task_entities = TaskEntities()
-        if self._recorder is not None:
-            self._recorder.entities((), [self._task_entities.others])
+        self._task_entities = TaskEntities(self._recorder)
         self._announcements: Announcements | None = None
         self._check_at: list[float] = []  # when to check again whether the context has ended
         super().__init__(context=context)

@@ -29,6 +29,7 @@ from mddag_executor.executor.compat import (
     BareTask,
     forget_task_frames,
     function_of_task,
+    name_of_task,
     QuickCallback,
 )
 from mddag_executor.executor.entity import Entity
@@ -37,6 +38,7 @@ from rclpy.task import Future
 
 if TYPE_CHECKING:
     from mddag_executor.executor.coroutines import Loops
+    from mddag_executor.executor.recorder import Recorder
 
 CHECK_S = 0.05
 """How often to check whether a callback still runs that has created a failed task."""
@@ -180,23 +182,29 @@ class TaskEntity(Entity):
     kind = 'task'
     names_type = False
 
-    __slots__ = ()
+    __slots__ = ('_symbol',)
 
-    def __init__(self) -> None:
-        super().__init__(None, '')
+    def __init__(self, node: str = '', symbol: str = '') -> None:
+        super().__init__(None, node)
+        self._symbol = symbol
+
+    @property
+    def symbol(self) -> str:
+        """Return module and name of its function."""
+        return self._symbol
 
 
 class TaskEntities:
     """
     The executor's records of tasks: one for each function, as each has its own GIL habit.
 
-    In a trace all tasks are of the same callback.
-
-    :ivar others: of functions beyond the ``REMEMBERED`` first ones.
+    :param recorder: records them in the trace; None: there is none.
     """
 
-    def __init__(self) -> None:
-        self.others = TaskEntity()
+    def __init__(self, recorder: Recorder | None) -> None:
+        self._recorder = recorder
+        # of functions beyond the ``REMEMBERED`` first ones
+        self._others = self._new(-1)
         self._entities: dict[object, TaskEntity] = {}
 
     def of(self, callback: Any, args: tuple[Any, ...], outer: int = -1) -> TaskEntity:
@@ -208,15 +216,20 @@ class TaskEntities:
         key = outer, function_of_task(callback, args)
         if key not in self._entities and len(self._entities) >= REMEMBERED:
             if outer < 0:
-                return self.others
+                return self._others
             key = outer, None
         found = self._entities.get(key)
         if found is None:
-            found = TaskEntity()
-            found.outer = outer
-            found.address = self.others.address
-            self._entities[key] = found
+            name = ('', '') if key[1] is None else name_of_task(callback, args)
+            found = self._entities[key] = self._new(outer, *name)
         return found
+
+    def _new(self, outer: int, node: str = '', symbol: str = '') -> TaskEntity:
+        entity = TaskEntity(node, symbol)
+        entity.outer = outer
+        if self._recorder is not None:
+            self._recorder.entities((), [entity])
+        return entity
 
 
 def make_task(

@@ -6,13 +6,16 @@ import inspect
 import threading
 import time
 
+from mddag_executor import open_recording
 from msg_graph import loads
 import pytest
+from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future, Task
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 from .conftest import matched, Spinning, wait_for
 from .declared import graph
@@ -323,3 +326,34 @@ def test_coroutines_ask_and_answer(make_executor, make_node):
         assert wait_for(lambda: len(answers) >= 3)
         timer.cancel()
     assert set(answers) == {'yes'}
+
+
+def test_a_recording_names_tasks_after_their_functions(make_executor, make_node, tmp_path):
+    """Those of goals belong to the node of the action server."""
+    node, path = make_node('arm'), tmp_path / 'run.mcap'
+    executor = make_executor(num_workers=2, nodes=[node], trace=path)
+
+    def reach(goal):
+        goal.succeed()
+        return Fibonacci.Result()
+
+    async def plan():
+        pass
+
+    server = ActionServer(node, Fibonacci, 'reach', reach)
+    client = ActionClient(node, Fibonacci, 'reach')
+    with Spinning(executor):
+        assert client.wait_for_server(15.0)
+        goal = client.send_goal_async(Fibonacci.Goal())
+        assert wait_for(goal.done)
+        result = goal.result().get_result_async()
+        tasks = [executor.create_task(each) for each in (plan, plan(), list)]
+        assert wait_for(lambda: result.done() and all(each.done() for each in tasks))
+    server.destroy()
+    client.destroy()
+    executor.shutdown()
+    recording = open_recording(path)
+    names = {recording.callback_name(each)
+             for each in recording.executions['callback'].tolist()}
+    assert names > {'/arm: reach (task)', 'plan (task)', 'list (task)'}
+    assert 'callback (task)' not in names
