@@ -154,7 +154,7 @@ class Explanation:
                 place: self._busy(rows[self._place[rows] == place], hangs)
                 for place in {*([0] if one else ()), *distinct(self._place[rows]).tolist()}},
             [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
-            self._place, of_vertex, threads, hangs, blocked, self._busy_programs(rows),
+            self._place, of_vertex, threads, hangs, blocked, self._busy_programs(),
             self._answers())
 
     def _hangs(self) -> tuple[Mask, dict[int, Spans]]:
@@ -175,19 +175,12 @@ class Explanation:
                        for vertex, of in self._groups.items() if of >= 0
                        and len(members := mine[group == of])}
 
-    def _busy_programs(self, rows: Ints) -> dict[int, Spans]:
+    def _busy_programs(self) -> dict[int, Spans]:
         """Return by vertex when callbacks of its program ran, if that runs one at a time."""
-        of_callback = self._who.programs
-        if not of_callback:
-            return {}
-        table = self._executions
-        numbers, which = different(table['callback'][rows])
-        program = np.array([of_callback.get(each, -1) for each in numbers.tolist()])[which]
-        spans = {}
-        for number in distinct(program[program >= 0]).tolist():
-            mine = rows[program == number]
-            spans[number] = Spans(*crowded(table['start'][mine], table['end'][mine], 1))
-        return {vertex: spans[number] for vertex, number in self._by_vertex(of_callback).items()
+        spans = {number: Spans(*crowded(runs['start'], runs['end'], 1))
+                 for number, runs in self._recording.runs_of_programs().items()}
+        return {vertex: spans[number]
+                for vertex, number in self._by_vertex(self._who.programs).items()
                 if number in spans}
 
     def _busy(self, rows: Ints, hangs: Mask) -> Busy:

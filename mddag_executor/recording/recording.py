@@ -172,23 +172,43 @@ class Recording:
         """Return by execution the place of its job in ``jobs``; -1: none."""
         return self.jobs.places(self.executions)
 
+    def runs_of_programs(self) -> dict[int, Table]:
+        """
+        Return by program that runs one callback at a time its executions that kept others waiting.
+
+        Others run while a callback waits in a call or a spin of its own, so an execution in which
+        another one of its program began is left out.
+        """
+        if not self.names.programs:
+            return {}
+        table, program = self.executions, self._programs
+        rows = np.flatnonzero((program >= 0) & (table['worker'] >= 0))
+        found = {}
+        for number in np.unique(program[rows]).tolist():
+            mine = table[rows[program[rows] == number]]
+            mine = mine[mine['start'].argsort(kind='stable')]
+            found[number] = mine[np.r_[mine['start'][1:] >= mine['end'][:-1], True]]
+        return found
+
     def exclusive_groups(self) -> dict[int, int]:
         """
         Return by callback a number that it shares with those that never run while it does.
 
         These are those of its program, if that runs one callback at a time; else those of its
-        callback group (-1: a reentrant one).  Other callbacks of a program run while one of its
-        coroutines waits, so a program with such a coroutine is left out.
+        callback group (-1: a reentrant one).  A program in which a callback ran while another one
+        waited (a coroutine, or in a call or a spin of its own) is left out.
         """
         groups, programs = self.names.groups, self.names.programs
         if not programs:
             return groups
-        table = self.executions
-        suspended = {programs.get(each) for each in np.unique(
-            table['callback'][table['piece'] > 0]).tolist()}
+        table, program = self.executions, self._programs
+        ran = np.bincount(program[(program >= 0) & (table['worker'] >= 0)])
+        let_others = {*program[table['piece'] > 0].tolist(), *(
+            number for number, runs in self.runs_of_programs().items()
+            if len(runs) < ran[number])}
         first = 1 + max(groups.values(), default=0)
         return {**groups, **{callback: first + program for callback, program in programs.items()
-                             if program not in suspended}}
+                             if program not in let_others}}
 
     def callbacks(self) -> tuple[Ints, Ints]:
         """Return the numbers of the callbacks that ran, and by execution the callback's index."""
@@ -206,6 +226,13 @@ class Recording:
     def callback_name(self, number: int) -> str:
         """Return the declared name of a callback, otherwise its node and trigger."""
         return self._keys.get(number) or self.names.name(number)
+
+    @cached_property
+    def _programs(self) -> Ints:
+        """Return by execution its program, if that runs one callback at a time; else -1."""
+        numbers, index = self.callbacks()
+        of = self.names.programs
+        return np.array([of.get(each, -1) for each in numbers.tolist()], dtype=np.int64)[index]
 
     @cached_property
     def _callbacks(self) -> tuple[Ints, Ints]:

@@ -36,7 +36,8 @@ PLANS = {
     'ran long': {'took': 20},
     'waited': {'wait': 25, 'others': 2},
     'group': {'wait': 25, 'others': 2, 'workers': 6, 'grouped': True},
-    'program': {'wait': 25, 'others': 2, 'workers': 6, 'holds': True, 'in_program': True},
+    'program': {'wait': 25, 'took': 1, 'others': 2, 'workers': 6, 'holds': True,
+                'in_program': True},
     'interpreter': {'wait': 25, 'others': 1, 'workers': 6, 'holds': True},
     'released late': {'lag': 15},
     # the message that comes first is only kept
@@ -125,6 +126,26 @@ def test_the_right_cause_is_told(cause, tmp_path):
                   if part['cause'] == cause for each in part['behind'] if each['ns'] > 5 * MS}
         assert behind == {'/heavy:first', '/heavy:second'}.difference(
             () if cause == 'waited' else ['/heavy:second'])
+
+
+@pytest.mark.parametrize('lets_others_run', [False, True])
+def test_callbacks_of_a_program_exclude_each_other_also_in_a_what_if(lets_others_run, tmp_path):
+    """Unless one of them waited in a call or a spin, so that others ran meanwhile."""
+    trace = Written(tmp_path / 'run.mcap', VICTIM, 6)
+    trace.program(3, 1100, 1200)    # both callbacks of /heavy
+    for job in range(10):
+        at, begin = 100 * job, 100 * job + (10 if lets_others_run else 30)
+        for dag in (1, 2):
+            trace.release(dag, job, at)
+        trace.run(1, 0, job, at, at + 30)
+        trace.run(2, 0, job, begin, begin + 10, ready=at, worker=1)
+    path = trace.end(1000)
+    recording = open_recording(path)
+    assert [len(runs) for runs in recording.runs_of_programs().values()] == [
+        10 if lets_others_run else 20]
+    sinks = reschedule(path).result()['dags']
+    slowest = sinks['second']['sinks']['/heavy:second']['response_ns']['max']
+    assert (slowest < 40 * MS) == lets_others_run
 
 
 @examples(8)
