@@ -12,6 +12,7 @@ import threading
 import time
 import weakref
 
+from mddag_executor.core.state import State
 from mddag_executor.executor import publishing, waitables
 from msg_graph import loads
 import pytest
@@ -26,7 +27,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import graph
-from .inside import pool_of, registry_of
+from .inside import engine_of, pool_of, registry_of
 
 # --- while others run ----------------------------------------------------------------------------
 
@@ -207,12 +208,14 @@ class Brief:
 
 
 # A busy machine has more stops, which are bounded, and slots, which are used again: an invariant.
-VARIES = 'State.x_', 'State.job_', 'Deadlines.', 'Stops.'
+VARIES, OF_SLOTS = ('Deadlines.', 'Stops.'), ('x_', 'job_')
 
 
 def sizes(executor):
     """Return the sizes of what the executor, and all that it consists of, has."""
     found, seen, todo = Counter(), set(), [executor]
+    state = engine_of(executor).scheduler.state     # others also refer to its columns
+    of_slots = {id(getattr(state, name)) for name in State._fields if name.startswith(OF_SLOTS)}
     while todo:
         owner = todo.pop()
         if id(owner) in seen or not type(owner).__module__.startswith('mddag_executor.'):
@@ -223,7 +226,7 @@ def sizes(executor):
             todo.append(value)
             name = f'{type(owner).__name__}.{name}'
             if (hasattr(value, '__len__') and not isinstance(value, str)
-                    and not name.startswith(VARIES)):
+                    and id(value) not in of_slots and not name.startswith(VARIES)):
                 found[name] += len(value)
     return found + Counter({
         'deliveries': sum(map(len, publishing._deliveries.values())),
