@@ -13,7 +13,7 @@ from collections.abc import Callable as Function
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.columns import concatenate, Ints, rows, Table
+from mddag_executor.recording.columns import Ints, rows, Table
 from mddag_executor.recording.joins import different, sort_by
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
@@ -152,16 +152,14 @@ def read_events(
         count += batch.n_events
         if progress is not None:
             progress(count)
-    table = concatenate(parts)
-    del parts
-    table = table[sort_by(table['time'], table['place'])]
+    table = _in_order(parts)
     tuples.sort(key=lambda each: (each[1][1], each[0]))
     possible = (table['time'] >= 0) & (table['time'] < NEVER)
     kept = [event for _, event in tuples if 0 <= event[1] < NEVER]
     impossible = table['time'][~possible].tolist() + [
         event[1] for _, event in tuples if not 0 <= event[1] < NEVER]
     threads, which = different(table['thread'])
-    table['thread'] = which
+    table.replace('thread', which)
     warning = '' if not impossible else (
         f'left out: {counted(len(impossible), "event")} at an impossible time, the first at '
         f'{impossible[0]} ns')
@@ -170,6 +168,20 @@ def read_events(
     return Events(
         table, [(each >> 32, (each & 0xFFFFFFFF) - (each & 0x80000000) * 2)
                           for each in threads.tolist()], kept, warning, names_of)
+
+
+def _in_order(parts: list[Table]) -> Table:
+    """Return tables as one, in the order of time and file; empties the list to save memory."""
+    columns = {name: [each[name] for each in parts] for name in parts[0].names}
+    parts.clear()
+    time, place = (np.concatenate(columns.pop(name)) for name in ('time', 'place'))
+    order = sort_by(time, place)
+    found = {'time': time[order], 'place': place[order]}
+    del time, place
+    for name in _EVENT.names or ():
+        if name in columns:
+            found[name] = np.concatenate(columns.pop(name))[order]
+    return Table(found)
 
 
 def _normal(events: Any, places: Ints, kind: tuple[Any, ...]) -> Table:

@@ -43,7 +43,7 @@ from collections.abc import Callable as Function
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from mddag_executor.recording.columns import Ints, Mask, rows, Table
+from mddag_executor.recording.columns import Ints, Mask, Places, rows, Table
 from mddag_executor.recording.joins import (
     as_of,
     different,
@@ -213,7 +213,7 @@ class Links:
     def _objects(
         self, events: Mask, known: Addresses[Any],
         find: Function[[int, int, int], Any] | None = None,
-    ) -> tuple[list[Any], Ints]:
+    ) -> tuple[list[Any], Places]:
         """Return the objects that column ``a`` of events means, and by event their index."""
         find = find or known.latest
         at = np.flatnonzero(events)
@@ -221,13 +221,13 @@ class Links:
         address = table['a'][at]
         _, process = different(self._pid)
         addresses, key = different(address)
-        key = key + process[table['thread'][at]] * max(1, len(addresses))
+        key = key + process[table['thread'][at]].astype(np.int64) * max(1, len(addresses))
         order = sort_by(key)
         begins = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0][:len(order)])
         groups = sorted(np.split(order, begins[1:]), key=lambda each: each[:1].tolist())
         objects: dict[int, int] = {}
         found: list[Any] = []
-        index = np.full(len(table), -1)
+        index = np.full(len(table), -1, dtype=np.int32)
         for group in groups if len(order) else ():
             where = (int(self._pid[table['thread'][at[group[0]]]]),
                      int(address[group[0]]) % ADDRESSES)
@@ -413,24 +413,27 @@ class Links:
         :return: pairs of topic and source timestamp of several possible publications; here none.
         """
         table, found = self.events, self.messages
-        kind, a = table['kind'], table['a']
-        publishes = np.isin(kind, _PUBLISHES)
-        about = np.isin(kind, (*_STAMPS, BECAME))
-        # by event: the last one of a publication, unless a callback began or ended after it
-        last = np.full(len(table), -1)
-        last[about] = self._last(publishes | (kind <= END), about)
-        last[about & (kind[np.maximum(last, 0)] <= END)] = -1
-        message = table['b'][np.maximum(last, 0)]
-        became = (kind == BECAME) & (last >= 0) & (a == message)
-        form = np.full(len(table), -1)
-        form[about] = self._last(publishes | (kind <= END) | became, about)
-        form = np.where((form >= 0) & became[np.maximum(form, 0)],
-                        table['b'][np.maximum(form, 0)], 0)
-        of = kind[np.maximum(last, 0)]
-        good = np.isin(kind, _STAMPS) & (last >= 0) & (of != INTRA) & (table['b'] != 0) & (
+        kinds = table['kind']
+        about = np.isin(kinds, (*_STAMPS, BECAME))
+        before = np.isin(kinds, _PUBLISHES) | (kinds <= END)
+        at = np.flatnonzero(about)
+        kind, a, stamp = (table[name][at] for name in ('kind', 'a', 'b'))
+        # the last event of a publication, unless a callback began or ended after it
+        last = self._last(before, about)
+        of, message = (table[name][np.maximum(last, 0)] for name in ('kind', 'b'))
+        known = (last >= 0) & (of > END)
+        became = known & (kind == BECAME) & (a == message)
+        form = np.zeros(len(at), dtype=np.int64)
+        if became.any():
+            becomes = np.zeros(len(table), dtype=np.bool_)
+            becomes[at[became]] = True
+            newest = self._last(before | becomes, about)
+            has_form = (newest >= 0) & becomes[np.maximum(newest, 0)]
+            form[has_form] = table['b'][newest[has_form]]
+        good = np.isin(kind, _STAMPS) & known & (of != INTRA) & (stamp != 0) & (
             (of != RCL) | (a == 0) | (a == message) | (a == form))
-        at = np.flatnonzero(good)[::-1]     # the first one is assigned last
-        found['stamp'][self._row[last[at]]] = table['b'][at]
+        mine = np.flatnonzero(good)[::-1]     # the first one is assigned last
+        found['stamp'][self._row[last[mine]]] = stamp[mine]
         return np.empty((0, 2), dtype=np.int64)
 
     def _find(self, topic: Ints, stamp: Ints) -> Ints:
@@ -487,7 +490,7 @@ class Links:
 
     def _may_take(self, at: Ints, callback: Ints) -> Mask:
         """Return whether callbacks are those of the subscriptions of `rmw_take` events."""
-        subscription = self._subscription[at]
+        subscription = self._subscription[at].astype(np.int64)
         pairs, which = different(subscription * len(self.callbacks) + callback)
         fits = [number < 0 or self.callbacks[each] in self.taken[number] for number, each in (
             divmod(pair, len(self.callbacks)) for pair in pairs.tolist())]
