@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from mddag_executor.core.tally import counts, total
+from mddag_executor.core.tally import counts, never_due, total
 from mddag_executor.report.tables import (
     drift_lines,
     guessed_lines,
@@ -46,6 +46,7 @@ def live_lines(result: dict[str, Any]) -> Iterator[str]:
         yield step_text(each['step_ns'])
     yield from unfinished_lines(result['unfinished'])
     yield from never_due_lines(result['dags'])
+    yield from _early_lines(result)
     if 'processes' in result:
         yield from _absent(result['dags'])
     measured = result['measured']
@@ -125,6 +126,17 @@ def _never_ran(result: dict[str, Any], reported: Collection[str]) -> Iterator[st
             yield (f'{counted(len(some), "declared callback")} never ran, as {why}'
                    f'{"" if some is waited else " it" if len(some) == 1 else " them"}: '
                    + listed([*some]))
+
+
+def _early_lines(result: dict[str, Any]) -> Iterator[str]:
+    """Yield a line about sinks that ran before the run was judged, and not later."""
+    runs = {sink: result['callbacks'].get(sink.partition('@')[0])
+            for sink in never_due(result['dags'])}
+    early = [sink for sink, each in runs.items()
+             if each is not None and each['ran'] > each['unattributed']]
+    if early:
+        yield ('ran only before all programs and processes were ready, which is not judged: '
+               + listed(early))
 
 
 def _absent(dags: dict[str, Any]) -> Iterator[str]:

@@ -28,7 +28,7 @@ from rclpy.task import Future
 from std_msgs.msg import Empty, String
 
 from ..json_results import errors_of
-from .conftest import Spinning, wait_for
+from .conftest import is_idle, Spinning, wait_for
 from .declared import CHAIN, Declared, graph
 
 SECOND = 1_000_000_000
@@ -224,6 +224,29 @@ def test_a_sync_that_never_got_one_of_its_topics(make_executor, make_node, tmp_p
     for text in (live[0].text, drift_of(open_recording(path))[0].text):
         assert text.startswith('/eye:see never got a message of /info in ')
         assert text.endswith(": did you mean the topic '/inf'?")
+
+
+def test_what_ran_only_before_the_begin_is_said(make_executor, make_node):
+    """A timer that fires once may do so before all processes of a run have met."""
+    executor = make_executor(loads(graph(
+        bringup='name: start, timer: 20ms, once: true, deadline: 1s')))
+    node, fired = make_node('bringup'), []
+
+    def start():
+        fired.append(1)
+        timer.cancel()
+
+    executor.set_judging(False)
+    timer = node.create_timer(0.02, start)
+    executor.add_node(node)
+    with Spinning(executor):
+        assert wait_for(lambda: fired and is_idle(executor))
+        executor.set_judging(True)
+        statistics = executor.statistics()
+    lines = [*live_lines({**statistics, 'measured': None})]
+    assert 'never due, so not judged: 1 sink: /bringup:start' in lines
+    assert ('ran only before all programs and processes were ready, which is not judged: '
+            '/bringup:start') in lines
 
 
 CAMERA = graph(
