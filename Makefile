@@ -9,8 +9,8 @@ PYTEST_ARGS ?= -n 3
 TEST_TAKES := 6 minutes on two cores
 BIN := $(VENV)/bin
 
-# The environment brings its own ROS packages. What a sourced ROS (or another environment's
-# interpreter) put into these variables would mix two installations.
+# The environment brings its own ROS packages. A sourced ROS (or the interpreter of another
+# environment) has put paths into these variables, which would mix two installations.
 unexport PYTHONHOME PYTHONPATH AMENT_PREFIX_PATH RMW_IMPLEMENTATION VIRTUAL_ENV
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ifneq ($(AMENT_PREFIX_PATH)$(_ROS_WHEELS_BOOTSTRAP_COMPLETE),)

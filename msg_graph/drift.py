@@ -225,8 +225,10 @@ def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift |
             "it is made again or reset when needed, 'sporadic: true'"))
     mean = releases.mean_ns() if releases.count >= LEAST else period
     if abs(mean - period) > TOLERANCE * period and not (callback.sporadic and mean > period):
-        text = (f'{callback.key} was released every {format_duration(mean)}, and '
-                f'{format_duration(period)} is declared')
+        text = f'{callback.key} was released ' + (
+            f'every {format_duration(mean)}, and {format_duration(period)} is declared' if mean
+            else f'{releases.count} times at the same time, and every {format_duration(period)} '
+            'is declared')
         if mean > period:
             text += f": if it {_SPORADIC[callback.kind == 'timer']}, declare 'sporadic: true'"
         return Drift('rate', callback.key, None, period, mean, printable(text))

@@ -39,7 +39,8 @@ def parse_duration(
     """
     Return the nanoseconds in a text such as ``100ms``, ``20 us`` or ``1.5s``.
 
-    Units are ns, us (or µs), ms, s and min. Fractions of a nanosecond are rounded to the nearest.
+    Units are ns, us (or µs), ms, s and min; zero needs none. Fractions of a nanosecond are rounded
+    to the nearest.
 
     :param minimum_ns: the least allowed time, ns.
     :param maximum_ns: the longest allowed time, ns.
@@ -47,15 +48,18 @@ def parse_duration(
         outside of the bounds.
     """
     match = _DURATION.fullmatch(text)
-    if match is not None and not match['unit']:
+    if match is None or match['unit'] not in ('', *UNITS):
+        raise DurationError(*(
+            (f'{quoted(text)} is a rate', "write the time between two, as '100ms' for 10 Hz")
+            if match is not None and match['unit'].lower() == 'hz' else
+            (f'{quoted(text)} is not a time',
+             "write a number and a unit (ns, us, ms, s, min), as '100ms'")))
+    number = Decimal(match['number'])
+    if number and not match['unit']:
         raise DurationError(
             f'{quoted(text)} has no unit',
             f"add one, as '{match['number']}ms' or '{match['number']}s' (ns, us, ms, s, min)")
-    if match is None or match['unit'] not in UNITS:
-        raise DurationError(
-            f'{quoted(text)} is not a time',
-            "write a number and a unit (ns, us, ms, s, min), as '100ms'")
-    exact = Decimal(match['number']) * UNITS[match['unit']]
+    exact = number * UNITS[match['unit'] or 's']    # zero needs no unit
     value = int(exact.to_integral_value(ROUND_HALF_EVEN))
     if not minimum_ns <= value <= maximum_ns:
         raise DurationError(

@@ -38,8 +38,10 @@ ARGUMENT_REFERENCE = r'\$\([A-Za-z_][A-Za-z0-9_]*\)'
 """An argument of the file in a value; the JSON Schema allows it in all values."""
 
 _DRIVEN = "write it inside of the sync, as 'sync: {topics: [/a, /b], driven_by: /a}'"
-ELSEWHERE = {'driven_by': _DRIVEN, 'topics': _DRIVEN}
-"""Keys that are often written in the wrong place, and where they belong."""
+ELSEWHERE = {
+    'driven_by': _DRIVEN, 'topics': _DRIVEN,
+    'deadline': "write it in a callback; a path has 'reaction:' and 'age:'"}
+"""Keys in the wrong place, and where they belong; the keys of other entries are added below."""
 
 _NUMBER = re.compile(r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?')
 _TOLERANCE_PATTERN = re.compile(r'[ \t]*([0-9]{1,6})[ \t]+of[ \t]+([0-9]{1,6})[ \t]*')
@@ -71,9 +73,10 @@ class Name:
     def check(self, text: str) -> str:
         """Return a name; raise ``ValueProblem`` if it is not valid."""
         problem, remedy = '', ''
-        if self.is_global and not text.startswith('/'):
+        full = '/' + text.lstrip('~/')
+        if self.is_global and not text.startswith('/') and self.pattern.fullmatch(full):
             problem = f'{quoted(text)} is not an absolute {self.what} name'
-            remedy = f'write it in full, as {quoted("/" + text.lstrip("~/"))}'
+            remedy = f'write it in full, as {quoted(full)}'
         elif not self.pattern.fullmatch(text):
             problem = f'{quoted(text)} is not a valid {self.what} name'
             remedy = ("use '/' and words of letters, digits and '_' that start with no digit"
@@ -114,7 +117,8 @@ ARGUMENT = Name('argument', re.compile(r'[A-Za-z_][A-Za-z0-9_]*'),
 def kind_of(tree: Tree) -> str:
     """Return a description of a tree."""
     if isinstance(tree, Scalar):
-        return 'an empty value' if tree.is_null else f'the text {quoted(tree.text)}'
+        return ('an empty value' if tree.is_null or not tree.text
+                else f'the text {quoted(tree.text)}')
     return 'a list' if isinstance(tree, Sequence) else 'a mapping'
 
 
@@ -401,6 +405,9 @@ def _key(text: str) -> str:
 def _read_execution_time(value: Tree, where: str) -> ExecutionTime:
     if isinstance(value, Scalar):
         return ExecutionTime((duration_kind(least_ns=1).read(value, where),), (50.0,))
+    if not isinstance(value, Mapping):
+        raise error_at(value, where, f'{kind_of(value)} is neither a time nor a mapping',
+                       "write a time, as '4ms', or 'quantiles_us:' with a list")
     entry = Entry(value, where, QUANTILES)
     quantiles_us, percent = entry.get('quantiles_us'), entry.get('percent')
     count = len(quantiles_us)
@@ -451,7 +458,7 @@ _DEADLINE = scalar(_deadline, {'anyOf': [duration_kind().schema, {'enum': [NO_DE
                    what="a time, as '100ms', or none")
 _WEAKLY_HARD = scalar(_weakly_hard, {
     'type': 'string', 'pattern': f'^(?:{_TOLERANCE_PATTERN.pattern})$|{ARGUMENT_REFERENCE}',
-    'examples': ['1 of 100']})
+    'examples': ['1 of 100']}, what="how many of how many, as '1 of 100'")
 _VALUES = mapping_of(scalar(str, {'type': ['string', 'number', 'boolean', 'null']}), ARGUMENT)
 _TOPICS = list_of(name_kind(TOPIC), 0, different=True)
 
@@ -474,7 +481,7 @@ SYNC_KEYS = {
 _SYNC = Kind(_read_sync, {'oneOf': [_SYNCED.schema, _mapping(SYNC_KEYS)]}, ((), None))
 
 FILE = {
-    'mddag': Key(scalar(_format, {'enum': [int(FORMAT), FORMAT]}),
+    'mddag': Key(scalar(_format, {'enum': [int(FORMAT), FORMAT]}, what=FORMAT),
                  'Version of the format.', needed=True),
     'arguments': Key(_VALUES,
                      'Arguments of this file, $(name) in its values, with their defaults.'),
@@ -515,8 +522,9 @@ CALLBACK_KEYS = {
     'period': Key(duration_kind(), 'Time between two releases of a source that is not a timer.'),
     'publishes': Key(_TOPICS, 'The topics that it publishes in each execution.'),
     'may_publish': Key(_TOPICS, 'Further topics, which it publishes only in some executions.'),
-    'reads': Key(list_of(scalar(_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]}), 0,
-                      different=True),
+    'reads': Key(list_of(scalar(_read, {'anyOf': [TOPIC.schema, CALLBACK.schema]},
+                                what='a topic, or the name of a callback of the node'), 0,
+                         different=True),
                  'Queue edges: topics that it takes messages from, and callbacks of its node '
                  'whose variables it reads. They never start it.'),
     'deadline': Key(_DEADLINE, 'Relative deadline of a sink, counted from the release of its DAG; '
@@ -551,8 +559,8 @@ CALLBACK_KEYS = {
 PATH_KEYS = {
     'name': Key(name_kind(PATH), 'Name of the path.', needed=True),
     'callbacks': Key(list_of(scalar(_key, {'type': 'string', 'pattern': (
-        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_REFERENCE}')}),
-        2, different=True, too_few='give at least 2'),
+        f'^(?:{NODE.pattern.pattern}):(?:{CALLBACK.pattern.pattern})$|{ARGUMENT_REFERENCE}')},
+        what="'/node:callback'"), 2, different=True, too_few='give at least 2'),
         "The callbacks along it, each as '/node:callback'.", needed=True),
     'reaction': Key(duration_kind(),
                     'Maximum reaction time: from a change right after an input of the '
@@ -561,6 +569,11 @@ PATH_KEYS = {
     'tolerate': Key(_WEAKLY_HARD, 'How many inputs or outputs in a row may be late, as '
                     "'1 of 100'."),
 }
+for _keys, _place in ((CALLBACK_KEYS, 'in a callback'), (PATH_KEYS, "in an entry of 'paths:'"),
+                      (FILE, 'at the top of the file, not indented')):
+    for _word in _keys:
+        if _word not in ('name', 'callbacks', 'tolerate'):  # several entries have these
+            ELSEWHERE.setdefault(_word, f'write it {_place}')
 
 
 def schema() -> Schema:

@@ -34,8 +34,6 @@ from typing import NamedTuple
 import hypothesis
 import pytest
 
-from .ros_domains import claim_domain
-
 HERE = Path(__file__).resolve().parent
 
 CI = bool(os.environ.get('CI'))
@@ -124,6 +122,8 @@ def keep_bytecode(environment, folder):
 
 def _claim_domain():
     """Return a domain that no other session has for as long as this one lasts."""
+    # not at the top: the package has no path there, before pytest's version 8
+    from .ros_domains import claim_domain
     domain, claim = claim_domain()
     if domain is None:
         raise pytest.UsageError('every ROS domain for tests is in use by another test session')

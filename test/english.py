@@ -5,9 +5,9 @@ Patterns of English that readers had to read twice, and what to write instead.
 
 Theory of operation
 -------------------
-1. The test reads the pages (Markdown, without code), and the comments, docstrings and messages
-   of Python files.  A text is one paragraph of a page, one block of comments, or one string with
-   a blank.
+1. The test reads the pages (Markdown, without code), the comments, docstrings and messages of
+   Python files, and the comments of scripts, workflows and other files (``#``).  A text is one
+   paragraph of a page, one block of comments, or one string with a blank.
 2. A pattern is a regular expression over a text whose line breaks are blanks.  It should find no
    good sentence: a pattern that has to be argued with is worse than none.
 3. The changelog of released versions is history, and stays as it is.
@@ -129,14 +129,26 @@ def python_texts(path):
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and (
                 ' ' in node.value and id(node) not in parts):
             yield node.lineno, node.value
+    yield from blocks((token.start[0], token.string) for token in tokenize.generate_tokens(
+        io.StringIO(source).readline) if token.type == tokenize.COMMENT)
+
+
+def comment_texts(path):
+    """Yield line and text of each block of comments of a script, a Makefile, YAML or TOML."""
+    yield from blocks((number, match[1]) for number, line in enumerate(
+        path.read_text(encoding='utf-8').splitlines(), 1)
+        if (match := re.search(r'(?:^|\s)(#(?!!).*)', line)))
+
+
+def blocks(comments):
+    """Yield line and text of each block of comments, of which the lines are given."""
     lines, first = [], 0
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type == tokenize.COMMENT:
-            if lines and token.start[0] != first + len(lines):
-                yield first, '\n'.join(lines)
-                lines = []
-            first = first if lines else token.start[0]
-            lines.append(token.string.lstrip('#: '))
+    for number, text in comments:
+        if lines and number != first + len(lines):
+            yield first, '\n'.join(lines)
+            lines = []
+        first = first if lines else number
+        lines.append(text.lstrip('#: '))
     if lines:
         yield first, '\n'.join(lines)
 
@@ -144,7 +156,8 @@ def python_texts(path):
 def findings(path, top=TOP):
     """Return a line for each pattern that a file has: place, words, and what to write."""
     found = []
-    for line, text in (page_texts if path.suffix == '.md' else python_texts)(path):
+    texts = {'.md': page_texts, '.py': python_texts}.get(path.suffix, comment_texts)
+    for line, text in texts(path):
         flat = re.sub(r':(ivar|param) (\w+):', r':\1 \2 ', text.replace('\n', ' '))
         for pattern in PATTERNS:
             for match in re.finditer(pattern.regex, flat):

@@ -77,6 +77,20 @@ def test_programs_share_bytecode_that_is_not_next_to_the_sources(tmp_path, unwan
     assert found.is_relative_to(tmp_path / ('kept' if unwanted else '__pycache__'))
 
 
+def test_pytest_7_finds_the_neighbours_of_the_conftest():
+    """Ubuntu has that version.  It does not import the package first, and Python has a `test`."""
+    code = (
+        'import importlib.util, sys, types\n'
+        'sys.modules["test"] = types.ModuleType("test")\n'
+        'spec = importlib.util.spec_from_file_location("test.conftest", sys.argv[1])\n'
+        'sys.modules["test.conftest"] = module = importlib.util.module_from_spec(spec)\n'
+        'spec.loader.exec_module(module)\n'
+        'print(module._claim_domain())')
+    done = subprocess.run([sys.executable, '-c', code, TOP / 'test' / 'conftest.py'], text=True,
+                          capture_output=True, check=True)
+    assert int(done.stdout) >= 0
+
+
 def test_tools_that_are_missing_are_known_with_their_packages():
     done = subprocess.run(
         [shutil.which('sh'), TOP / '.ci' / 'tools', 'missing'], env={'PATH': '/nowhere'},

@@ -231,5 +231,27 @@ def test_images_and_links():
         assert path.stat().st_size <= LARGEST_IMAGE, f'{path.name} is too large'
         assert path.name in ''.join(texts.values()), f'{path.name} is on no page'
     for page, text in texts.items():
-        for name in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
-            assert page.startswith('docs/') or (TOP / page).parent.joinpath(name).exists(), name
+        for name, anchor in re.findall(r'\]\(([^)#:]+)(?:#([^)]*))?\)', text):
+            # those between pages of the site are checked when that is built
+            path = (TOP / page).parent / name
+            assert page.startswith('docs/') or path.exists(), f'{page}: {name}'
+            assert page.startswith('docs/') or not anchor or anchor in anchors(path), (
+                f'{page}: {name}#{anchor}')
+
+
+def anchors(path):
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r'^#+ (.*)$', path.read_text(encoding='utf-8'), re.MULTILINE)
+    return {re.sub(r'[^\w\- ]', '', each).strip().lower().replace(' ', '-') for each in headings}
+
+
+@pytest.mark.parametrize('page', PAGES)
+def test_blocks_begin_after_an_empty_line(page):
+    """Else Python-Markdown, which makes the site, shows them as text of the paragraph."""
+    text = re.sub(r'^( *)```.*?^\1```$', '', (TOP / page).read_text(encoding='utf-8'),
+                  flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r'^ *<!--.*-->$', '', text, flags=re.MULTILINE)
+    for paragraph in re.split(r'\n(?: *\n)+', text):
+        first, *lines = paragraph.strip('\n').split('\n')
+        assert [line for line in lines for begin in (r'#+ ', r'\|', r' *(?:[*-]|\d+\.) ')
+                if re.match(begin, line) and not re.match(begin, first)] == []

@@ -68,8 +68,16 @@ def test_mypy():
 UNCHECKED_ENGLISH = ('test/english.py',)
 
 
+def others():
+    """Return the further files with comments, those of a checkout: scripts, workflows and such."""
+    patterns = ('Makefile', 'MANIFEST.in', '*.toml', '*.yml', '.ci/*', '.github/**/*.yml',
+                'docker/*', 'config/*.yaml', 'examples/**/*.sh', 'examples/**/*.yaml',
+                'resource/mddag')
+    return sorted(path for pattern in patterns for path in TOP.glob(pattern) if path.is_file())
+
+
 def test_english():
-    paths = [*(TOP / page for page in pages()), *SOURCES]
+    paths = [*(TOP / page for page in pages()), *SOURCES, *others()]
     found = [line for path in paths
              if not path.relative_to(TOP).as_posix().startswith(UNCHECKED_ENGLISH)
              for line in english.findings(path)]
@@ -81,11 +89,13 @@ def test_english():
 def test_english_patterns_find_their_examples(pattern, tmp_path):
     text = pattern.example.replace('`', '')
     assert re.search(pattern.regex, text), pattern
-    page, module = tmp_path / 'page.md', tmp_path / 'module.py'
+    page, module, script = tmp_path / 'page.md', tmp_path / 'module.py', tmp_path / 'script'
     page.write_text(f'# Title\n\n* {text}\n\n```text\n{text}\n```\n', encoding='utf-8')
     module.write_text(f'"""{text}"""\n# {text}\n', encoding='utf-8')
     assert len(english.findings(page, tmp_path)) == 1
     assert len(english.findings(module, tmp_path)) == 2
+    script.write_text(f'#!/bin/sh\n# {text}\nrun  # {text}\n', encoding='utf-8')
+    assert len(english.findings(script, tmp_path)) == 2
 
 
 def test_tests_import_helpers_and_not_each_other():

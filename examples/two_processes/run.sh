@@ -1,6 +1,6 @@
 #!/bin/sh
 # Two processes, the same declaration: sensor and filter in one, control in the other. The deadline
-# is judged where its sink runs. The first runs until it is told to end: the other waits for it and
+# is judged where its sink runs. The first runs until it gets a signal: the other waits for it and
 # then takes 3 s. On two computers, run one of these commands on each.
 cd "$(dirname "$0")" || exit 1
 mddag=${MDDAG:-mddag}

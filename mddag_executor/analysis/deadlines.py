@@ -5,7 +5,7 @@ The verdicts of a recording, computed from its tables.
 
 Theory of operation
 -------------------
-The rules are rules 1, 2, 6, 8, 10, 15 and 16 of the scheduler core (``core.rules``), applied to
+The rules are rules 1, 2, 6, 8, 9, 11, 13 and 14 of the scheduler core (``core.rules``), applied to
 all jobs at once; ``test/analysis/test_deadlines.py`` compares both implementations.
 
 1. A vertex completes when the last of its legs completes; in an imported recording, with the

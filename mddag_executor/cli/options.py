@@ -32,7 +32,7 @@ def duration(text: str) -> int:
 
 def duration_or_zero(text: str) -> int:
     """Return the nanoseconds of a time that may be zero, which needs no unit."""
-    return 0 if text == '0' else _time(text, minimum_ns=0)
+    return _time(text, minimum_ns=0)
 
 
 def _time(text: str, **bounds: int) -> int:

@@ -14,8 +14,9 @@ Theory of operation
 3.  Each function that is called is translated once (``statements``, ``expressions``).  All of
     them form one module of LLVM (``program``), and LLVM decides which ones it links into their
     callers.  ``writer`` writes the instructions, ``machine_code`` has LLVM make code of them.
-4.  A list that a function makes is a vector of its own, whose memory it frees when it returns.
-    Without memory the program ends.
+4.  A list that a function makes is a vector of its own, whose memory it frees when it returns.  It
+    has one name.  A list in a list has a new address when the outer list becomes longer, so a
+    variable must not have it then.  Without memory the program ends.
 5.  An argument that is a function is not passed: a program has one function for all of these.  An
     argument that may be a function or None is always None.
 

@@ -67,7 +67,8 @@ class Expressions(ast.NodeVisitor):
 
     def truth(self, node: ast.expr) -> Any:
         """Return the bit of an expression: whether it counts as true."""
-        value: Value = self.visit(node)
+        value: Value = (
+            self._all_or_any(node) if isinstance(node, ast.BoolOp) else self.visit(node))
         if value.kind is TRUTH:
             return value.words[0]
         if isinstance(value.kind, Vector):
@@ -102,11 +103,14 @@ class Expressions(ast.NodeVisitor):
         """Return a variable, or a constant of the module."""
         variable = self.variables.get(node.id)
         if variable is None:
-            return self._constant(node, self.named(node))
+            found = self.named(node)
+            if found is None:
+                raise self._writer.error(node, f'{node.id} has no value here')
+            return self._constant(node, found)
         return Value(variable.kind, tuple(map(self._builder.load, variable.places)))
 
     def named(self, node: ast.expr) -> Any:
-        """Return what a name of the module, or of Python, means; None: it is another name."""
+        """Return the value of a name of the module, or of Python; None: it is another name."""
         if not isinstance(node, ast.Name) or node.id in self.variables:
             return None
         names = self._writer.callee.source.names
@@ -200,6 +204,25 @@ class Expressions(ast.NodeVisitor):
             writer.choose(list(zip(words, blocks))) for words in zip(one.words, other.words)))
 
     def visit_BoolOp(self, node: ast.BoolOp) -> Value:
+        """Return the integer that decides: the first one that is true (or), or is not (and)."""
+        if _is_truth(node):
+            return self._all_or_any(node)
+        writer, after = self._writer, self._writer.block('decided')
+        found: list[tuple[Any, Any]] = []
+        for each in node.values[:-1]:
+            word = self.integer(each)
+            found.append((word, self._builder.block))
+            following = writer.block('next')
+            self._builder.cbranch(
+                self._builder.icmp_signed('!=', word, INT64(0)),
+                *((after, following) if isinstance(node.op, ast.Or) else (following, after)))
+            writer.begin(following)
+        found.append((self.integer(node.values[-1]), self._builder.block))
+        writer.go_to(after)
+        writer.begin(after)
+        return integer(writer.choose(found))
+
+    def _all_or_any(self, node: ast.BoolOp) -> Value:
         """Return whether all values, or any, count as true."""
         return self._short_circuit(isinstance(node.op, ast.Or), [
             lambda each=each: self.truth(each) for each in node.values])  # type: ignore[misc]
@@ -260,6 +283,8 @@ class Expressions(ast.NodeVisitor):
         if isinstance(operator, (ast.In, ast.NotIn)):
             bit = self._contains(node, right, left)
             return self._builder.not_(bit) if isinstance(operator, ast.NotIn) else bit
+        if type(operator) not in _COMPARISONS:
+            raise writer.error(node, f'{type(operator).__name__} is not compiled here')
         left, right = map(writer.as_integer, (left, right))
         if left.kind != right.kind or not (left.kind is INTEGER or isinstance(left.kind, Tuple)):
             raise writer.error(node, f'{left.kind} and {right.kind} are not compared')
@@ -289,6 +314,9 @@ class Expressions(ast.NodeVisitor):
         if self._argument(node.func) is KNOWN:
             function = self._writer.program.known
         if function in _BUILTINS:
+            if node.keywords:
+                raise self._writer.error(
+                    node, f'{function.__name__} with {node.keywords[0].arg}= is not compiled')
             return _BUILTINS[function](self, node)
         if function is free_all:
             return self._free_all(node)
@@ -333,7 +361,7 @@ class Expressions(ast.NodeVisitor):
             if kind.nested and isinstance(value, ast.List) and not value.elts:
                 writer.append_empty(header, kind)
             else:
-                self.append(header, kind, value)
+                self.append(header, kind, self.visit(value), node)
         elif method.attr == 'pop' and not node.args:
             last = self._builder.sub(writer.length(header), INT64(1))
             writer.set_length(header, last)
@@ -344,9 +372,9 @@ class Expressions(ast.NodeVisitor):
             raise writer.error(node, f'{method.attr} of a list is not compiled')
         return Value(NOTHING, ())
 
-    def append(self, header: Any, kind: Vector, node: ast.expr) -> None:
+    def append(self, header: Any, kind: Vector, value: Value, node: ast.AST) -> None:
         """Append a value to a list."""
-        value = self._writer.as_kind(kind.element, self.visit(node), node)
+        value = self._writer.as_kind(kind.element, value, node)
         self._writer.set_element(header, kind, self._writer.lengthen(header, kind), value)
 
     def _free_all(self, node: ast.Call) -> Value:
@@ -384,6 +412,14 @@ class Expressions(ast.NodeVisitor):
             found = self._builder.select(
                 self._builder.icmp_signed(sign, other, found), other, found)
         return integer(found)
+
+
+def _is_truth(node: ast.expr) -> bool:
+    """Return whether the value of an expression is True or False, not another integer."""
+    if isinstance(node, ast.BoolOp):
+        return all(map(_is_truth, node.values))
+    return isinstance(node, ast.Compare) or (
+        isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not))
 
 
 _BUILTINS: dict[Any, Callable[[Expressions, ast.Call], Value]] = {

@@ -47,6 +47,7 @@ class _Statements(ast.NodeVisitor):
         self._exit = self._writer.block('exit')
         self._result: tuple[Any, ...] = ()
         self._loops: list[Loop] = []
+        self._own_lists: set[str] = set()
 
     def write(self) -> None:
         """Write the function into the module."""
@@ -94,6 +95,7 @@ class _Statements(ast.NodeVisitor):
             for each, value in zip(target.elts, values, strict=True):
                 self._assign_to(each, value)
         else:
+            self._refuse_own_list(node.value)
             value = self._expressions.visit(node.value)
             for each in node.targets:
                 self._assign_to(each, value)
@@ -103,14 +105,23 @@ class _Statements(ast.NodeVisitor):
         target = node.targets[0]
         if not isinstance(target, ast.Name) or not values.elts or len(node.targets) > 1:
             raise self._writer.error(node, 'only one name can be a new list, with an element')
+        # the list may occur in its own new elements
+        elements = [self._expressions.visit(each) for each in values.elts]
         if target.id not in self._expressions.variables:
-            first = self._expressions.visit(values.elts[0]).kind
+            first = elements[0].kind
             kind = vector(first.width if isinstance(first, Tuple) else 0)
             self._assign(target.id, Value(kind, (self._writer.new_list(),)))
+            self._own_lists.add(target.id)
         header, kind = self._expressions.list(ast.Name(target.id, ast.Load()))
         self._writer.set_length(header, INT64(0))
-        for each in values.elts:
-            self._expressions.append(header, kind, each)
+        for value in elements:
+            self._expressions.append(header, kind, value, node)
+
+    def _refuse_own_list(self, node: ast.expr) -> None:
+        """Refuse a second name for a list of this function, which changes or is freed with it."""
+        if isinstance(node, ast.Name) and node.id in self._own_lists:
+            raise self._writer.error(
+                node, f'{node.id} is a list of this function, and can have no other name')
 
     def _assign(self, name: str, value: Value, node: ast.AST | None = None) -> None:
         value = self._writer.as_integer(value)
@@ -165,6 +176,7 @@ class _Statements(ast.NodeVisitor):
     def visit_Return(self, node: ast.Return) -> None:
         """Keep the result, and go to the exit."""
         if node.value is not None:
+            self._refuse_own_list(node.value)
             value = self._expressions.visit(node.value)
             value = self._writer.as_kind(self._callee.result, value, node)
             for word, place in zip(value.words, self._result):
@@ -237,9 +249,11 @@ class _Statements(ast.NodeVisitor):
 
     def _repeat(self, node: ast.For, values: ast.Tuple) -> None:
         after = self._writer.block('after')
-        for each in values.elts:
+        # the turns may change what the elements are made of
+        elements = [self._expressions.visit(each) for each in values.elts]
+        for value in elements:
             following = self._writer.block('following')
-            self._assign_to(node.target, self._expressions.visit(each))
+            self._assign_to(node.target, value)
             self._write_turn(node.body, Loop(None, following, after))
             self._writer.go_to(following)
             self._writer.begin(following)

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Jobs as a whole: rules 1, 6 to 8 and 9 of the scheduling rules, which ``rules`` lists.
+Jobs as a whole: rules 1, 6, 8, 9, 11 and 13 of the scheduling rules, which ``rules`` lists.
 
 Jobs are opened, judged and ended here, and their slots recycled.  Like ``rules`` this module
 contains only integer arithmetic and list indexing.

@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Who holds the interpreter (the GIL), and when what waits may overtake it (``core.rules``, rule 11).
+Who holds the interpreter (the GIL), and when what waits may overtake it (``core.rules``, rule 10).
 
 Executions that hold it form a chain: each one overtook the one before, and only the latest
 computes.  All times are ns on the trace's clock.

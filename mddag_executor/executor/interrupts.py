@@ -38,9 +38,10 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = __name__.partition('.')[0]
 _MOST_FD_OF_SELECT = 1023
 _FAULTS = (signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT)
-_NUMBERS = tuple(
+# SIGINT, which usually raises, is the first to be replaced, and the last to be restored.
+_NUMBERS = (signal.SIGINT, *(
     number for number in sorted(signal.valid_signals())
-    if number < signal.SIGRTMIN and number not in _FAULTS)
+    if number < signal.SIGRTMIN and number not in (signal.SIGINT, *_FAULTS)))
 # Without the conversion of ``signal`` to enumerations: this runs in each ``spin_once``.
 _signal: Any = import_module('_signal')
 REPEAT_S = 0.05
@@ -72,7 +73,7 @@ class _Deferred:
 
     def __init__(self) -> None:
         self.originals: dict[int, Any] = {}
-        self.pending: dict[int, None] = {}
+        self.pending: dict[int, bool] = {}
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Call the original handler, or defer that."""
@@ -82,7 +83,7 @@ class _Deferred:
             self.pending.pop(number, None)
             self.originals[number](number, frame)
         elif not is_second:
-            self.pending[number] = None
+            self.pending[number] = True
             if number != signal.SIGINT:
                 # not a ``Thread``: the signal may have interrupted one that starts, with its lock
                 _thread.start_new_thread(self._repeat, (number,))
@@ -95,11 +96,12 @@ class _Deferred:
 
     def call_pending(self) -> None:
         """Call the original handlers now whose calls were deferred."""
-        if self.pending:
-            number = next(iter(self.pending))
-            del self.pending[number]
+        numbers = list(self.pending)
+        if numbers:
             try:
-                self.originals[number](number, sys._getframe())
+                # unless a second one has come meanwhile, whose handler was called at once
+                if self.pending.pop(numbers[0], False):
+                    self.originals[numbers[0]](numbers[0], sys._getframe())
             finally:
                 self.call_pending()
 
@@ -159,7 +161,7 @@ class InterruptsDeferred:
         """Restore the handlers, and call those that were deferred."""
         if threading.current_thread() is not threading.main_thread():
             return
-        for number in self._replaced:
+        for number in reversed(self._replaced):
             if _signal.getsignal(number) == _deferred.handle:
                 _signal.signal(number, _deferred.originals[number])
         if _deferred.pending:
@@ -181,17 +183,22 @@ def _is_of_rclpy(number: int) -> bool:
     return get_current_signal_handlers_options() in (SignalHandlerOptions.ALL, one)
 
 
+def _call_pending() -> None:
+    if threading.current_thread() is threading.main_thread():
+        _deferred.call_pending()
+
+
 @interruptible
 def wait_for_permit(lock: threading.Lock, seconds: float | None) -> bool:
     """Acquire a lock that another thread releases; return whether that was in time."""
-    if threading.current_thread() is threading.main_thread():
-        _deferred.call_pending()
+    _call_pending()
     return lock.acquire(timeout=-1 if seconds is None else seconds)
 
 
 @interruptible
 def interruptible_sleep(seconds: float) -> None:
     """Sleep; an interrupt ends that."""
+    _call_pending()
     time.sleep(seconds)
 
 
@@ -202,8 +209,7 @@ def wait_readable(fd: int, seconds: float | None) -> None:
 
     :param seconds: the timeout; None: for ever.
     """
-    if threading.current_thread() is threading.main_thread():
-        _deferred.call_pending()
+    _call_pending()
     if fd <= _MOST_FD_OF_SELECT:  # its resolution is 1 us; that of ``poll`` is 1 ms
         select.select([fd], [], [], seconds)
     else:

@@ -9,9 +9,10 @@ releases from ``Watch``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Literal, TYPE_CHECKING
 
-from mddag_executor.results.runs import Statistics
+from mddag_executor.results.runs import CallbackCounts, Statistics
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
 
@@ -29,11 +30,18 @@ class Watch:
         self._begin = self._now()
         self._end: int | None = None
         self._releases = [Releases() for _ in task_set.dags]
+        self._before: Mapping[str, CallbackCounts] = {}
         executor._engine.verdicts.on_release = self._released
 
     def _released(self, dag: int, release: int) -> None:
         if dag < len(self._releases):
             self._releases[dag].add(release)
+
+    def restart(self) -> None:
+        """Watch from now on: what ran before has only been seen."""
+        self._begin = self._now()
+        self._releases = [Releases() for _ in self._task_set.dags]
+        self._before = self._executor.statistics()['callbacks']
 
     def stop(self) -> None:
         """Watch no longer: the run has ended."""
@@ -52,9 +60,16 @@ class Watch:
         return Observed(
             duration_ns=max(0, end - first), end_ns=end,
             releases=dict(zip(sources, self._releases)),
-            messages={key: count['ready'] for key, count in counts.items()},
-            executions={key: count['ran'] for key, count in counts.items()},
+            messages=self._since_begin(counts, 'ready'),
+            executions=self._since_begin(counts, 'ran'),
             topics_received={**self._executor._registry.received()},
             publishes={**self._executor._registry.bindings.published()},
             nodes={key.rpartition(':')[0] for key in counts},
             undeclared=self._executor._registry.bindings.undeclared())
+
+    def _since_begin(
+        self, counts: Mapping[str, CallbackCounts], which: Literal['ready', 'ran'],
+    ) -> dict[str, int]:
+        """Return counts since the begin, at least 1 for a callback that has one from before it."""
+        return {key: count[which] - self._before[key][which] or min(1, count[which])
+                if key in self._before else count[which] for key, count in counts.items()}

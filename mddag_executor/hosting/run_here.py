@@ -205,6 +205,7 @@ class _Run:
                         raise SystemExit(SIGNAL + signals.ended_by)  # as if it had come before
                     self._has_started = False
                 executor.set_judging(True, self._begin_of_several())
+                self._watch.restart()
                 session.wait(self._options.seconds)
         except MddagError as error:
             # The exception of a callback says more than that its program failed to start.

@@ -59,6 +59,9 @@ def conditions(box: Box, several: Boxes, a: int, b: int) -> None:
     box.found.append(int((a, b) >= (3, 4)) + 2 * int((a, b) != (1, 1)))
     box.found.append(a if a > b else b)
     box.found.append(int(a in SMALL) + 2 * int(a not in box.numbers))
+    box.found.append(a or b)
+    box.found.append((a and b) + 100 * (b and a > 3))
+    box.found.append(a and b or len(box.numbers) or a - b)
 
 
 def loops(box: Box, several: Boxes, a: int, b: int) -> None:
@@ -81,6 +84,9 @@ def loops(box: Box, several: Boxes, a: int, b: int) -> None:
         if total > 100:
             break
         numbers.append(1)
+    for number in (a, a + b, total):
+        a += 5
+        total += number + a
     while True:
         total -= 3
         if total < 10:
@@ -100,6 +106,10 @@ def lists(box: Box, several: Boxes, a: int, b: int) -> None:
                 waiting.append(number - 3)
         if b == 1:
             return
+    mine = [a, b]
+    mine = [len(mine), mine[1], mine.pop() + mine[0]]
+    for number in mine:
+        box.found.append(number)
     pairs = [(a, b)]
     pairs.append((b, a))
     last, _ = pairs.pop()
@@ -225,8 +235,10 @@ REFUSED = {
     'box.found == box.found': 'list and list are not compared',
     '[a for _ in box.found]': 'ListComp is not compiled',
     "'text'": "'text' cannot be a constant of compiled code",
-    'unknown': 'None cannot be a constant of compiled code',
+    'unknown': 'unknown has no value here',
     'box.heap[0]': 'this is tuple, not int',
+    'a < b is a': 'Is is not compiled here',
+    'max(a, b, key=abs)': 'max with key= is not compiled',
     'helper(1)': 'helper needs a, call',
     'helper(1, helper)': 'call must be None',
 }
@@ -249,3 +261,21 @@ def refused(box: Box, a: int) -> int:
     with pytest.raises(NotCompiledError) as error:
         translated(space['refused'])
     assert str(error.value) == f'{path}:6: {what}'
+
+
+@pytest.mark.parametrize('last', ('other = mine', 'return mine'))
+def test_a_list_that_a_function_makes_has_one_name(tmp_path, last):
+    from mddag_executor.compiler.program import NotCompiledError
+    path = tmp_path / 'refused.py'
+    path.write_text(f"""\
+def refused(box: Box) -> {'None' if 'other' in last else 'list[int]'}:
+    mine = [1]
+    mine.append(2)
+    {last}
+""")
+    space = {'Box': Box, '__name__': 'refused'}
+    exec(compile(path.read_text(), str(path), 'exec'), space)
+    with pytest.raises(NotCompiledError) as error:
+        translated(space['refused'])
+    assert str(error.value) == (
+        f'{path}:4: mine is a list of this function, and can have no other name')

@@ -226,6 +226,39 @@ def test_a_sync_that_never_got_one_of_its_topics(make_executor, make_node, tmp_p
         assert text.endswith(": did you mean the topic '/inf'?")
 
 
+def test_what_ran_before_the_begin_is_no_drift(make_executor, make_node):
+    """In several processes a camera may run for a while before its subscriber is made."""
+    task_set = loads(graph(
+        camera='name: grab, timer: 20ms, publishes: [/image]',
+        eye='name: see, subscription: /image, deadline: 20ms'))
+    executor = make_executor(task_set, num_workers=2)
+    watch = Watch(executor, task_set)
+    camera, eye, sent, seen = make_node('camera'), make_node('eye'), [], []
+    image = camera.create_publisher(Empty, 'image', 10)
+
+    def grab():
+        image.publish(Empty())
+        sent.append(1)
+
+    timer = camera.create_timer(0.02, grab)
+    executor.add_node(camera)
+    with Spinning(executor):
+        assert wait_for(lambda: len(sent) > 30)
+        eye.create_subscription(Empty, 'image', seen.append, 10)
+        executor.add_node(eye)
+        assert wait_for(lambda: seen)
+        assert [each.kind for each in watch.drift(executor.statistics())] == ['rate']
+        watch.restart()
+        assert watch.drift(executor.statistics()) == []
+        missed = len(sent)
+        assert wait_for(lambda: len(sent) > missed + 15)
+        timer.cancel()
+        assert wait_for(lambda: is_idle(executor))
+        found = watch.drift(executor.statistics())
+    # a machine that stops for a second skips releases
+    assert [each for each in found if each.callback == '/eye:see'] == []
+
+
 def test_what_ran_only_before_the_begin_is_said(make_executor, make_node):
     """A timer that fires once may do so before all processes of a run have met."""
     executor = make_executor(loads(graph(

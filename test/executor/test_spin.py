@@ -13,6 +13,7 @@ import types
 
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor import workers
+from mddag_executor.executor.interrupts import interruptible_sleep, InterruptsDeferred
 from mddag_executor.executor.shutdown import call_at_shutdown
 import pytest
 import rclpy
@@ -435,6 +436,47 @@ def test_an_interrupt_at_any_line_of_a_spin_loses_nothing(
         assert until(lambda: str(n) in received and answer.done() and task.done()), n  # noqa: B023
         assert until(lambda: len(fired) > seen), n  # noqa: B023
     assert interrupts > 20
+
+
+def test_an_interrupt_at_any_line_of_a_deferral_restores_all_handlers(request):
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGALRM
+    handlers = [signal.default_int_handler, lambda *_: None, lambda *_: None]
+    for number, handler in zip(numbers, handlers):
+        before = signal.signal(number, handler)
+        request.addfinalizer(lambda number=number, before=before: signal.signal(number, before))
+    injector, line, interrupts = Injector(signal.SIGINT), 0, 0
+
+    def defer():
+        with InterruptsDeferred():
+            pass
+
+    while injector.left <= 0:   # until there is no such line
+        line += 1
+        interrupts += injector.interrupts(defer, line)
+        assert list(map(signal.getsignal, numbers)) == handlers, line
+    assert interrupts > 20
+
+
+def test_a_second_signal_at_any_line_of_a_deferred_one_is_no_error(request):
+    handled = []
+    before = signal.signal(signal.SIGINT, lambda *_: handled.append(1))
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
+    injector, line = Injector(signal.SIGINT), 0
+    of_package = types.FunctionType(
+        signal_inside.__code__, {**globals(), '__name__': 'mddag_executor'})
+    while injector.left <= 0:
+        line += 1
+        injector.interrupts(of_package, line)
+        assert 1 <= len(handled) <= 2, line
+        handled.clear()
+    assert line > 20
+
+
+def signal_inside():
+    """Send a signal while all are deferred, and wait."""
+    with InterruptsDeferred():
+        signal.raise_signal(signal.SIGINT)
+        interruptible_sleep(0)
 
 
 @pytest.mark.parametrize('kind', ['sleep', 'call', 'coroutine', 'publish'])

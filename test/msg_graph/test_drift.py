@@ -69,6 +69,7 @@ WHEN_NEEDED = "if it is made, reset or cancelled when needed, declare 'sporadic:
     ({'periods': {'/a:t': 11 * MS}},
      ['the timer of /a:t has a period of 11ms, and 10ms is declared']),
     (released(0.81), []), (released(1.19), []),
+    (released(0), ['/a:t was released 50 times at the same time, and every 10ms is declared']),
     (released(0.79), ['/a:t was released every 7.9ms, and 10ms is declared']),
     (released(1.21), [f'/a:t was released every 12.1ms, and 10ms is declared: {WHEN_NEEDED}']),
     ({'messages': {'/b:m': 39}}, []), ({'messages': {'/b:m': 60}}, []),
