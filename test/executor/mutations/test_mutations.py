@@ -155,7 +155,8 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_a_mutually_exclusive_group_is_kept_though_two_executors_run_it'), every=True),
     Case('tasks_hold_nothing', [(
         'executor/tasks.py', 'found = self._entities[key] = self._new(outer, *name)',
-        'found = self._entities[key] = self._new(outer, *name); found.habit.is_declared = True')], of(
+        'found = self._entities[key] = self._new(outer, *name)\n'
+        '            found.habit.is_declared = True')], of(
         'test_gil.py', 'test_a_task_holds_the_gil_if_its_function_does[False]',
         'test_a_task_holds_the_gil_if_its_function_does[True]'), every=True),
     Case('those_that_go_on_wait_for_ever', [(
