@@ -56,6 +56,10 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late, boot):
     assert result['workers'] == 4 and set(result['callbacks']) == {'/a:tick', '/b:take'}
     assert outcome.recording.names.workers == ['up 0', 'up 1', 'down 0', 'down 1']
     assert result['recording']['shut_down'] and result['recording']['end_ns'] == BASE + 100 * MS
+    releases = {(row['dag'], row['job']) for row in outcome.recording.releases.records()}
+    executions = outcome.recording.executions.records()
+    assert len(releases) == len(outcome.recording.releases) == 3
+    assert [(row['dag'], row['job']) in releases for row in executions] == [True] * 6
 
 
 @pytest.mark.parametrize(('where', 'cause'), [('down', 'interpreter'), ('up', 'machine')])
