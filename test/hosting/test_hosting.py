@@ -416,7 +416,9 @@ class Lidar(Node):
         super().__init__(name, **more)
         rate = self.declare_parameter('rate', 10).value
         scans = self.create_publisher(Header, 'scan', 1)
-        print(self.get_fully_qualified_name(), scans.topic_name, rate, flush=True)
+        # one write for each line, as two programs print
+        name = self.get_fully_qualified_name()
+        print(f'{name} {scans.topic_name} {rate}\\n', end='', flush=True)
 
 def main():
     rclpy.init()
@@ -428,7 +430,7 @@ def main():
 """)
     done = mddag(
         'run', '--node', 'lidar:main --ros-args -r __ns:=/front -p rate:=20',
-        '--node', 'lidar:main --ros-args -r __ns:=/back', '--duration', '1s', '--trace', 't.mcap',
+        '--node', 'lidar:main --ros-args -r __ns:=/back', '--duration', '3s', '--trace', 't.mcap',
         '--ros-args', '-r', 'scan:=cloud')
     assert done.returncode == 0, done.stderr
     assert {line for line in done.stdout.splitlines() if line.startswith('/')} >= {
