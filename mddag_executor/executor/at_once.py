@@ -74,9 +74,15 @@ class AtOnce:
 
     def count(self, entity: Entity) -> None:
         """Count a callback that has run."""
-        self.has_run = True
         with self.pool.lock:
             self.pool.engine.ran_at_once(entity)
+        self.handled(entity)
+
+    def handled(self, entity: Entity) -> None:
+        """Note that an arrival has been handled, whether or not its outer group is open."""
+        self.has_run = True
+        if self.pool.callback_ended is not None:
+            self.pool.callback_ended(entity.rclpy_object, None, -1)
 
 
 class SignalPipe(ChannelSource):

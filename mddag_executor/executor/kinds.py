@@ -42,11 +42,13 @@ class AtOnceHall(Protocol):
     """The spinning thread, to a source that it handles at once: see ``at_once.AtOnce``."""
 
     loop: EventLoop
-    has_run: bool
 
     @property
     def timers(self) -> Timers:
         """Return the timers that it fires."""
+
+    def handled(self, entity: Entity) -> None:
+        """Note that an arrival has been handled."""
 
     def count(self, entity: Entity) -> None:
         """Count a callback that has run."""

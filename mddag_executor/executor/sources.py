@@ -350,4 +350,4 @@ class ClientEntity(ArrivalEntity):
         compat.complete_request(
             self.rclpy_object, header.request_id.sequence_number, response,
             pool.outer_groups.get(self.outer) or pool.executor)
-        self.rooms.at_once.has_run = True
+        self.rooms.at_once.handled(self)

@@ -171,7 +171,8 @@ class GuestExecutor:
             self._n_stepping += 1
         groups = self._groups()
         seen = self._n_ended
-        # callbacks that are in no group also run between two spins: this step is what they end
+        # What is in no group (a concurrent callback), or handled at once (a response), also runs
+        # between two spins: it ends this step.
         seen_free = getattr(self._seen, 'n_free_ended', 0)
         own = outer_here()
 

@@ -308,6 +308,7 @@ class Messages:
         if entity.at_once:
             entity.rclpy_object.callback(message)
             engine.ran_at_once(entity)
+            self._loop.on_ended(entity.rclpy_object)
             return
         args: tuple[Any, ...] = (message,)
         if callback_type(entity.rclpy_object) is WITH_INFO:

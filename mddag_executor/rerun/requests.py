@@ -151,6 +151,7 @@ class Requests:
     def _answer(self, client: Client, number: int, response: Any) -> None:
         if alive(client):
             complete_request(client, number, response, self._executor)
+            self._loop.on_ended(client)
 
     # --- actions ---------------------------------------------------------------------------------
 

@@ -101,6 +101,7 @@ class Timers:
             return
         if ends_sleep(callback):
             callback()
+            self._loop.on_ended(timer)
             return
         info = {'expected_call_time': due, 'actual_call_time': now}
         engine.timer_due(Work(known.entity, with_timer_info(timer, callback, info)), now, now)

@@ -32,12 +32,14 @@ differences that are documented.
 """
 
 import argparse
+from array import array
 from collections import Counter
 from importlib import import_module
 import os
 from pathlib import Path
 import random
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -46,13 +48,14 @@ import time
 from typing import Any, NamedTuple
 
 from geometry_msgs.msg import Twist, Vector3
+from nav_msgs.msg import Odometry
 import rclpy
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, qos_profile_sensor_data, QoSProfile
 from rclpy.task import Future
-from sensor_msgs.msg import LaserScan
+from sensor_msgs.msg import Image, LaserScan
 from std_msgs.msg import String
 
 sys.path.append(str(Path(__file__).parents[1]))
@@ -77,6 +80,9 @@ _KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 URDF = """<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="continuous">
 <parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint></robot>"""
 
+LANE = array('B', bytes([0, 200, 200, 255]) * 64 * 200)
+"""A picture of the colour of the lane."""
+
 
 class Program(NamedTuple):
     """A program to compare."""
@@ -87,6 +93,7 @@ class Program(NamedTuple):
     inputs: tuple[tuple[str, Any], ...] = ()  # messages by topic, published at 20 Hz
     constant: tuple[str, ...] = ()  # the topics whose last message must be the same
     parameters: tuple[str, ...] = ()  # ROS parameters, ``name:=value``
+    arguments: tuple[str, ...] = ()  # of its command line; files are in the folder of sources
     # service, type, request, at 5 Hz; or action, type, goal, one goal after the other
     calls: tuple[tuple[str, str, dict[str, Any]], ...] = ()
     # the program is a client of these services and actions: name, type, response or result
@@ -185,9 +192,12 @@ PROGRAMS = (
         'crazyswarm2/crazyflie_examples', 'crazyswarm2/crazyflie_py'), (
             ('/cmd_vel', Twist(linear=Vector3(x=0.2))),)),
     Program('epuck_drive_calibrator', 'webots_ros2_epuck.drive_calibrator:main', (
-        'webots_ros2/webots_ros2_epuck',)),
+        'webots_ros2/webots_ros2_epuck',), (('/odom', Odometry()),), ('/cmd_vel',),
+            ('type:=angular',)),
     Program('tesla_lane_follower', 'webots_ros2_tesla.lane_follower:main', (
-        'webots_ros2/webots_ros2_tesla',)),
+        'webots_ros2/webots_ros2_tesla',), (
+            ('/vehicle/camera/image_color', Image(height=200, width=64, data=LANE)),),
+            ('/cmd_ackermann',)),
     Program('behavior_mirror', 'flexbe_mirror.behavior_mirror_sm:main', _FLEXBE),
     Program('be_input', 'flexbe_input.input_action_server:main', _FLEXBE),
     Program('behavior_onboard', 'flexbe_onboard.start_behavior:main', _FLEXBE),
@@ -196,7 +206,8 @@ PROGRAMS = (
     Program('dispatch_patrol', 'rmf_demos_tasks.dispatch_patrol:main', (
         'rmf_demos/rmf_demos_tasks',)),
     Program('fleet_manager', 'rmf_demos_fleet_adapter.fleet_manager:main', (
-        'rmf_demos/rmf_demos_fleet_adapter',)),
+        'rmf_demos/rmf_demos_fleet_adapter',), arguments=(
+            '-c', 'rmf_demos/rmf_demos/config/office/tinyRobot_config.yaml', '-n', 'no graph')),
     Program('yasmin_demo', 'yasmin_demos.yasmin_demo:main', (
         'yasmin/yasmin_demos', 'yasmin/yasmin')),
 )
@@ -331,12 +342,14 @@ class Place:
     """
     Where programs run: their modules, and a ROS domain that no test of this machine has.
 
+    :param sources: the folder of sources, in which they run.
     :param paths: the folders of the program's packages, and what else has to be importable.
     :param folder: a temporary one, for a module that says when the program begins.
     """
 
-    def __init__(self, program, paths, folder):
+    def __init__(self, program, sources, paths, folder):
         self.program = program
+        self._sources = sources
         module, function = program.spec.split(':')
         Path(folder, 'begun.py').write_text(
             f'import {module} as m\n\n\ndef main():\n    print({_BEGUN!r}, flush=True)\n'
@@ -347,17 +360,17 @@ class Place:
     def start(self, hosted):
         """Start the program with its own executor, or with this one."""
         command = ['-c', f'import sys; sys.argv[0] = {self.program.name!r}\n'
-                   'from begun import main\nsys.exit(main())']
+                   'from begun import main\nsys.exit(main())', *self.program.arguments]
         if hosted:
-            command = ['-m', 'mddag_executor', 'run', '--node', 'begun:main', '--diagnostics',
-                       'off', '--quiet']
+            command = ['-m', 'mddag_executor', 'run', '--node', shlex.join((
+                'begun:main', *self.program.arguments)), '--diagnostics', 'off', '--quiet']
         if self.program.parameters:
             command += ['--ros-args']
         for parameter in self.program.parameters:
             command += ['-p', parameter]
         return subprocess.Popen(
-            [sys.executable, *command], env=self._env, text=True, errors='replace',
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+            [sys.executable, *command], env=self._env, cwd=self._sources, text=True,
+            errors='replace', stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
 def _status(process):
@@ -481,13 +494,13 @@ def missing(program, path):
     return done.stderr.strip().splitlines()[-1] if done.returncode else ''
 
 
-def compare(program, path, seconds, interrupts):
+def compare(program, sources, path, seconds, interrupts):
     """Compare the runs of a program; return the result, and whether they differ."""
     why = missing(program, path)
     if why:
         return f'skipped: {why}', None
     with tempfile.TemporaryDirectory() as folder:
-        place = Place(program, path, folder)
+        place = Place(program, sources, path, folder)
         theirs, ours = (observe(place, hosted, seconds) for hosted in (False, True))
         if theirs.end == 'by itself' and theirs.status:  # it compares nothing
             return f'skipped: it ends at once: {sorted(theirs.lines)[-1:]}', None
@@ -522,7 +535,7 @@ def main():
             if options.only in (None, program.name):
                 path = [str((options.sources / each).resolve()) for each in program.folders]
                 said, differs = compare(
-                    program, path + before, options.seconds, options.interrupts)
+                    program, options.sources, path + before, options.seconds, options.interrupts)
                 differ.append(differs)
                 print(f'{program.name}: {said}', flush=True)
     print(f'{len(differ) - differ.count(None)} programs compared, {differ.count(True)} differ')

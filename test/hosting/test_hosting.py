@@ -326,6 +326,12 @@ def test_a_step_ends_with_what_a_concurrent_callback_did_before_it(world, mddag,
         assert (done.returncode, done.stdout, done.stderr) == (0, 'waits: 1 has run\n', '')
 
 
+def test_a_response_ends_a_step(world, mddag, monkeypatch):
+    monkeypatch.setenv('PYTHONPATH', str(GUESTS), prepend=os.pathsep)
+    done = mddag('run', '-q', '--node', 'overlap:answers', '--node', 'overlap:asks_in_steps')
+    assert (done.returncode, done.stdout) == (0, 'asks: answered\n'), done.stderr
+
+
 def test_a_context_of_a_programs_own_is_left_alone(world, mddag):
     done = mddag('run', '--node', 'chat:has_another_context')
     assert done.returncode == 0 and 'Traceback' not in done.stderr, done.stderr

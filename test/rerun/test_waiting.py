@@ -79,6 +79,24 @@ def test_services_of_later_programs_are_waited_for_without_delay(bag, graph):
     assert seen == [*range(20)]
 
 
+def test_a_response_ends_a_step(bag, graph):
+    said = []
+
+    def main():
+        rclpy.init()
+        node = rclpy.create_node('client')
+        client = node.create_client(Trigger, '/greet')
+        client.wait_for_service()
+        future = client.call_async(Trigger.Request())
+        while not future.done():
+            rclpy.spin_once(node)
+        said.append((future.result().message, node.get_clock().now().nanoseconds - START))
+
+    run_filter(bag, graph, lambda node, number: None, main, server)
+    (message, after), = said
+    assert message == 'hello' and after < 100 * MS, after
+
+
 def test_ros_arguments(bag, graph):
     seen = []
 

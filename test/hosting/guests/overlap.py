@@ -6,8 +6,12 @@ import random
 import time
 
 import rclpy
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.executors import (
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -16,7 +20,7 @@ ENOUGH = 150
 
 
 class Robot:
-    """Two nodes with callbacks of all kinds, none of them in a group."""
+    """Two nodes with callbacks of all kinds, which may all overlap for their groups."""
 
     def __init__(self, name):
         rclpy.init()
@@ -33,7 +37,9 @@ class Robot:
         self.client = self.node.create_client(Trigger, f'{name}/ask', **free)
         self.node.create_timer(0.004, self.tick, **free)
         other.create_timer(0.003, self.work, **free)
-        self.node.create_timer(0.05, self.calls_and_spins, **free)
+        # its own group: on a busy machine it would wait within itself without end
+        self.node.create_timer(0.05, self.calls_and_spins,
+                               callback_group=MutuallyExclusiveCallbackGroup())
 
     def work(self, *_):
         self.inside += 1
@@ -91,6 +97,33 @@ def spins():
 def steps():
     robot = Robot('steps')
     robot.run(SingleThreadedExecutor(), robot.steps)
+
+
+def asks_in_steps():
+    """Step for responses, also for one that comes between two steps."""
+    rclpy.init()
+    node = Node('asks')
+    client = node.create_client(Trigger, 'answers/ask')
+    client.wait_for_service(60.0)
+    for pause in (0.0, 0.3, 0.0):
+        future = client.call_async(Trigger.Request())
+        time.sleep(pause)
+        rclpy.spin_once(node)
+        while not future.done():
+            rclpy.spin_once(node)
+    print('asks: answered', flush=True)
+    node.create_client(Trigger, 'answers/end').call_async(Trigger.Request())
+
+
+def answers():
+    rclpy.init()
+    node = Node('answers')
+    node.create_service(Trigger, 'answers/ask', lambda _, response: response)
+    node.create_service(Trigger, 'answers/end', lambda _, response: rclpy.shutdown() or response)
+    try:
+        rclpy.spin(node)
+    except ExternalShutdownException:
+        pass
 
 
 def waits_between_steps():
