@@ -67,13 +67,15 @@ class Robot:
             future.set_result(None)
 
 
-def is_noted(path, killed):
+def is_noted(path, killed, waits_for):
     """Return whether a killed process would leave a note of the execution; copy what it leaves."""
     shutil.copy(path, killed)
     try:
-        recording = replay(killed, loads(GRAPH)).recording
-        # on a busy machine an earlier one, whose end has not been written, may be there first
-        return len(recording.unfinished) == 1 and 'test_unfinished' in recording.names.places[0]
+        found = replay(killed, loads(GRAPH)).result()['unfinished']
+        # on a busy machine an earlier one, whose end has not been written, may be there first, or
+        # this one before it waits
+        return len(found) == 1 and 'test_unfinished' in found[0]['where'] and (
+            found[0]['where'].endswith(waits_for))
     except MddagError:      # nothing has been written yet
         return False
 
@@ -101,7 +103,7 @@ def test_a_callback_that_does_not_end_is_named(
         hung = executor.statistics()['unfinished']
         assert wait_for(lambda: (executor.statistics()['unfinished'] or hung)[0]['for_ns']
                         > 200 * MS)
-        assert wait_for(partial(is_noted, path, killed))
+        assert wait_for(partial(is_noted, path, killed, waits_for))
         level, message = executor._diagnostics._pool.status(0)[1:3]
         assert (level, where in message, message.count('has run for')) == (1, True, 1)
         session.hurry()
