@@ -109,7 +109,7 @@ def test_unmodified_programs_run_on_our_executor(world):
         env={**os.environ, 'PYTHONUNBUFFERED': '1'},
     ) as process:
         try:
-            wait_for(lambda: not missing(lines), 60.0)
+            assert wait_for(lambda: not missing(lines), 110.0), missing(lines)
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=60)
         finally:
