@@ -52,7 +52,7 @@ class Server(Node):
         return response
 
     async def ask(self, request, response):
-        """Call another service of this node: nothing deadlocks, whatever its callback group."""
+        """Call a service of this node, which is in another group; the client is in this one's."""
         answer = await self.client.call_async(Trigger.Request())
         response.success, response.message = True, f'the other service {answer.message}'
         return response
