@@ -381,7 +381,8 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Call a function after each callback, and each piece of a coroutine, in its thread.
 
-        It is also called, in the spinning thread, after a response that is handled at once (``at_once``).
+        It is also called, in the spinning thread, after a response that is handled at once
+        (``at_once``).
 
         :param listener: receives rclpy's entity (None: a task), the exception of its callback, or
             None, and the number of the outer group in which it ran, or -1; returns whether it

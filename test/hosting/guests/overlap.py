@@ -100,7 +100,7 @@ def steps():
 
 
 def asks_in_steps():
-    """Step for responses, also for one that comes between two steps."""
+    """Step for responses, and for one that comes between two steps."""
     rclpy.init()
     node = Node('asks')
     client = node.create_client(Trigger, 'answers/ask')
