@@ -16,3 +16,8 @@ def engine_of(executor):
 def registry_of(executor):
     """Return the entities that it knows: see ``registry.Registry``."""
     return executor._registry
+
+
+def functions_of_tasks(executor):
+    """Return the records of the functions that have been tasks: see ``tasks.TaskEntities``."""
+    return list(executor._task_entities._entities.values())

@@ -26,7 +26,7 @@ from std_msgs.msg import Header, Int32
 from std_srvs.srv import Trigger
 
 from .conftest import is_idle, matched, Pulse, Spinning, wait_for
-from .inside import pool_of
+from .inside import functions_of_tasks, pool_of
 
 MS = 1_000_000
 
@@ -269,8 +269,7 @@ def test_a_response_makes_no_task(make_executor, make_node):
     cancelled = client.call_async(Trigger.Request())
     cancelled.cancel()
     assert not client._pending_requests
-    tasks = executor._task_entities
-    assert not any(each.ready for each in (tasks.others, *tasks._entities.values()))
+    assert not functions_of_tasks(executor)
 
 
 def test_tasks_nodes_and_entities_wake_an_idle_executor(make_executor, make_node, spinning):
