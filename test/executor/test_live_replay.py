@@ -119,7 +119,7 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
     path, misses, waiting = tmp_path / 'live.mcap', [], []
     nodes = Declared(make_node, GRAPH, {
         'detect': lambda: time.sleep(0.002), 'rectify': partial(rectify, waiting),
-        'join': every(7, 0.015), 'use': every(9, 0.007),
+        'join': every(7, 0.015), 'use': every(9, 0.007), 'tick': every(20, 0.035),
         'show': lambda: time.sleep(random.uniform(0.0, 0.008))})
     undeclared = nodes.nodes['filter'].create_timer(0.03, lambda: time.sleep(0.001))
     executor = make_executor(
@@ -167,7 +167,7 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
     assert sinks['/right:watch']['completed'] > 20
     imu = live['dags']['/imu']
     assert imu['ends']['late'] + imu['ends']['dropped'] > 3
-    assert sum(live['dropped'].values()) > 0
+    assert sum(live['dropped'].values()) > 3
     for breakdown, response in breakdowns:
         worst = breakdown['worst']
         assert worst['completed_ns'] - worst['release_ns'] == response['max']
