@@ -107,7 +107,7 @@ def composed(draw):
         data['paths'] = [{'name': f'p{number}', 'callbacks': pair, **draw(REQUIREMENTS)}
                          for number, pair in enumerate(chosen)]
     if draw(st.booleans()):
-        data['workers'] = draw(st.sampled_from([1, 7, 4096]))
+        data['workers'] = draw(st.sampled_from([1, 7, 64]))
     if draw(st.integers(0, 3)) == 3:  # something wrong or extreme
         callback, = draw(st.sampled_from(data['nodes']))['callbacks']
         key = draw(st.sampled_from(sorted(EXTREME)))
