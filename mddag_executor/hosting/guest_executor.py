@@ -226,13 +226,15 @@ class GuestExecutor:
 
     def _groups(self) -> list[Any]:
         """Return the outer groups that a spin opens."""
-        if self.is_pool:
-            return []
         owners: list[Any] = [self]
         if self.is_global:
             owners = Executor.get_nodes(self)  # type: ignore[arg-type]
-        groups = [self.host.group_of(owner, _limit(self) == 1) for owner in owners]
+        groups = [self._group_of(owner) for owner in owners]
         return [group for group in groups if group is not None]
+
+    def _group_of(self, owner: Any) -> Any:
+        """Return the outer group of this executor, or of one of its nodes; None: none."""
+        return None if self.is_pool else self.host.group_of(owner, _limit(self) == 1)
 
     def _open(self, groups: list[Any], is_step: bool) -> bool:
         """Let callbacks run; return whether one may start in a step that opens the groups."""
@@ -270,8 +272,7 @@ class GuestExecutor:
     def _adopt(self, nodes: list[Node]) -> None:
         for node in nodes:
             owner = node if self.is_global else self
-            self.host.put(node, None if self.is_pool else self.host.group_of(
-                owner, _limit(self) == 1))
+            self.host.put(node, self._group_of(owner))
             self.host.adopt(node, self.guest)
         if nodes and self.guest is not None:
             self.guest.is_complete = True
