@@ -398,14 +398,10 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     times = np.zeros((len(spans), len(PARTS)), dtype=np.int64)
     times[:, GROUP] = np.minimum(spans['more'], left)
     left = left - times[:, GROUP]
-    times[:, NEVER_ENDED] = _blocked(spans, times[:, GROUP], pool)
+    # of the waits for a group, those in which it was blocked for ever
+    times[:, NEVER_ENDED] = np.minimum(times[:, GROUP], _overlap(spans, pool.blocked))
     times[:, GROUP] -= times[:, NEVER_ENDED]
-    occupied = np.zeros(len(spans), dtype=np.int64)
-    for vertex in distinct(spans['vertex']).tolist():
-        if vertex in pool.programs:
-            mine = np.flatnonzero(spans['vertex'] == vertex)
-            occupied[mine] = pool.programs[vertex].within(
-                spans['begin'][mine], spans['end'][mine])
+    occupied = _overlap(spans, pool.programs)
     # the group is busy only while the program is
     times[:, PROGRAM] = np.clip(occupied - np.minimum(spans['more'], occupied), 0, left)
     left = left - times[:, PROGRAM]
@@ -435,13 +431,12 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     return times
 
 
-def _blocked(spans: Table, most: Ints, pool: Pool) -> Ints:
-    """Return for how long callback groups were blocked for ever in waits, of so much at most."""
+def _overlap(spans: Table, busy: dict[int, Spans]) -> Ints:
+    """Return for how long of each span something of its vertex was busy; 0: nothing is known."""
     found = np.zeros(len(spans), dtype=np.int64)
-    for vertex, blocked in pool.blocked.items():
+    for vertex, runs in busy.items():
         mine = np.flatnonzero(spans['vertex'] == vertex)
-        found[mine] = np.minimum(
-            most[mine], blocked.within(spans['begin'][mine], spans['end'][mine]))
+        found[mine] = runs.within(spans['begin'][mine], spans['end'][mine])
     return found
 
 
