@@ -201,7 +201,7 @@ def unjudged_sinks(plan):
 class Soak:
     """One endurance run; ``say`` receives what happens, one line each."""
 
-    def __init__(self, task_set, seconds, utilisation, workers, seed, say):
+    def __init__(self, task_set, seconds, utilisation, workers, seed, say, trace=None):
         self._seconds = seconds
         self._say = say
         self._random = random.Random(seed)
@@ -211,7 +211,7 @@ class Soak:
         self._clean_missed = []
         self._settle_s = min(2.0, max(v.deadline_ns or 0 for v in task_set.vertices) / 1e9)
         self.executor = MultiDeadlineExecutor(
-            task_set, num_workers=workers, on_deadline_miss=self._on_miss)
+            task_set, num_workers=workers, trace=trace, on_deadline_miss=self._on_miss)
         self.nodes = SoakNodes(task_set, plan)
         self._simulated = SimulatedTime()
         self._stalls = StallWatch()
@@ -408,12 +408,14 @@ def main():
     parser.add_argument('--utilisation', type=float, default=0.8)
     parser.add_argument('--workers', type=int, default=7)
     parser.add_argument('--seed', type=int, default=2)
+    parser.add_argument(
+        '--trace', help='record the run to this file: mddag explain says why a job was late')
     args = parser.parse_args()
     rclpy.init(args=[])
     try:
         result = Soak(
             load(args.graph), args.seconds, args.utilisation, args.workers, args.seed,
-            lambda text: print(text, file=sys.stderr, flush=True)).run()
+            lambda text: print(text, file=sys.stderr, flush=True), args.trace).run()
     finally:
         try_shutdown()
     print(json.dumps(result, indent=1))
