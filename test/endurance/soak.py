@@ -30,7 +30,6 @@ import argparse
 from collections import deque
 from contextlib import suppress
 import ctypes
-from dataclasses import asdict
 import gc
 import json
 import os
@@ -208,7 +207,7 @@ class Soak:
         plan = ExecutionPlan(task_set, seed, utilisation, workers, 'sleep')
         self._unjudged = unjudged_sinks(plan)
         self._missed = deque()
-        self._clean_missed = []
+        self._clean_missed = []  # fault, release and vertex: there may be thousands
         self._settle_s = min(2.0, max(v.deadline_ns or 0 for v in task_set.vertices) / 1e9)
         self.executor = MultiDeadlineExecutor(
             task_set, num_workers=workers, trace=trace, on_deadline_miss=self._on_miss)
@@ -229,8 +228,9 @@ class Soak:
         """Keep of the misses only those in clean windows."""
         while self._missed:  # others append meanwhile
             miss = self._missed.popleft()
-            self._clean_missed += [(fault, miss) for start, end, fault in self._clean
-                                   if start <= miss.release_ns < end]
+            self._clean_missed += [
+                (fault, miss.release_ns, miss.vertex) for start, end, fault in self._clean
+                if start <= miss.release_ns < end]
 
     def _spin(self):
         while not self._ending:
@@ -353,8 +353,9 @@ class Soak:
             start - 500_000_000 <= stall < stop + 200_000_000 for stall in stalls)]
         self._sort_out()
         clean_misses = [
-            (fault, miss) for fault, miss in self._clean_missed
-            if any(start <= miss.release_ns < stop for start, stop in judged)]
+            {'after': fault, 'release_ns': release, 'vertex': vertex}
+            for fault, release, vertex in self._clean_missed
+            if any(start <= release < stop for start, stop in judged)]
         result = {
             'seconds': elapsed, 'faults': self.counts, 'before': before, 'after': after,
             'jobs': sum(d['jobs'] for d in statistics['dags'].values()),
@@ -363,8 +364,7 @@ class Soak:
             'clean_windows': len(self._clean),
             'disturbed_windows': len(self._clean) - len(judged),
             'stalls': len(stalls), 'clean_misses': len(clean_misses),
-            'clean_missed': [
-                {'after': fault, **asdict(miss)} for fault, miss in clean_misses[:MOST_LISTED]],
+            'clean_missed': clean_misses[:MOST_LISTED],
             'unjudged_sinks': self._unjudged, 'simulated_ticks': ticks}
         result['failed'] = [*self._failures(result, statistics, n_open), *self._errors]
         if not simulated_goes_on:
