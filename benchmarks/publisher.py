@@ -28,6 +28,7 @@ from typing import Any
 from mddag_executor.child import ChildError
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.session import MATCH_TIMEOUT_S
+from mddag_executor.shared_memory import segments_removed
 from mddag_executor.synthetic.workload import QOS
 import rclpy
 from rclpy.publisher import Publisher
@@ -54,8 +55,9 @@ class PublisherProcess:
         return self
 
     def __exit__(self, *args: object) -> None:
-        self._process.kill()
-        self._process.join()
+        with segments_removed(self._process.pid or 0):
+            self._process.kill()
+            self._process.join()
 
     def wait_until_ready(self) -> None:
         """

@@ -22,6 +22,7 @@ import time
 from typing import Any, NoReturn
 
 from mddag_executor.errors import MddagError
+from mddag_executor.shared_memory import remove_segments, segments_removed
 from msg_graph import GraphError
 
 _PR_SET_PDEATHSIG = 1
@@ -70,8 +71,9 @@ def run_child(
         how = f'crashed with signal {-status}' if status < 0 else f'ended with status {status}'
         raise CrashError(f'{name}: it {how} and gave no result') from None
     finally:
-        process.kill()
-        process.join()
+        with segments_removed(process.pid or 0):
+            process.kill()
+            process.join()
         results.close()
     if error is not None:
         raise error(result if error is ChildError else f'{name}: {result}')
@@ -88,7 +90,11 @@ def _answer(
     # This machine only: the child and nodes of other machines must not discover each other.
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     try:
-        sender.send((None, pkgutil.resolve_name(function)(*arguments)))
+        try:
+            result = pkgutil.resolve_name(function)(*arguments)
+        finally:
+            remove_segments()   # first: the parent kills this process when it has the answer
+        sender.send((None, result))
     except (MddagError, GraphError) as error:
         sender.send((ChildError, str(error)))
     except BaseException as error:

@@ -7,6 +7,7 @@ Every session (and every worker of pytest-xdist) claims a ROS domain that no oth
 machine has, and discovery stays on this machine, so tests neither hear a robot nor disturb one.
 Each also has a folder for temporary files, which has to be empty at its end. This folder is in the
 environment of the test's processes, so that they can be found: none of them may still be running.
+If a session is killed, its guard ends these processes and removes the folder (see ``leftovers``).
 
 A test marked `needs('graphviz')` is skipped where `.ci/tools` misses that program, and the last
 line says so. With CI in the environment nothing may be missing: such a test fails, and so does a
@@ -76,8 +77,11 @@ def pytest_configure(config):
     os.environ.setdefault('PYTEST_DEBUG_TEMPROOT', tempfile.gettempdir())
     # programs that tests start inherit it
     os.environ.setdefault('MDDAG_DEBUG', str(HERE / 'invariants.py'))
-    tempfile.tempdir = _session.enter_context(
-        tempfile.TemporaryDirectory(prefix='mddag-test-', ignore_cleanup_errors=True))
+    # not at the top: the package has no path there, before pytest's version 8
+    from .leftovers import guarded
+    folder = tempfile.TemporaryDirectory(prefix='mddag-test-', ignore_cleanup_errors=True)
+    _session.enter_context(guarded(folder.name))
+    tempfile.tempdir = _session.enter_context(folder)
     keep_bytecode(os.environ, Path(tempfile.tempdir, BYTECODE))
     os.environ.pop('ROS_STATIC_PEERS', None)
     os.environ.update(
@@ -122,7 +126,6 @@ def keep_bytecode(environment, folder):
 
 def _claim_domain():
     """Return a domain that no other session has for as long as this one lasts."""
-    # not at the top: the package has no path there, before pytest's version 8
     from .ros_domains import claim_domain
     domain, claim = claim_domain()
     if domain is None:
@@ -206,41 +209,26 @@ def _is_in(nodeid, places):
 def nothing_left_behind():
     """Fail a session that leaves temporary files behind, or processes for more than a while."""
     yield
+    from .leftovers import kill, processes_of
+    folder = Path(tempfile.gettempdir())
     end = time.monotonic() + 10.0
-    while processes := _processes():
+    while processes := processes_of(folder):
         if time.monotonic() > end:
-            for pid in processes:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
+            kill(processes)
             break
         time.sleep(0.05)
-    folder = Path(tempfile.gettempdir())
     files = [str(path) for path in folder.rglob('*')
              if (top := path.relative_to(folder).parts[0]) not in ('log', BYTECODE)
              and not top.startswith('.org.chromium.')]
     assert (processes, files) == ({}, []), 'the tests left these processes and files behind'
 
 
-def _processes():
-    """Return what runs with this session's folder in its environment."""
-    found = {}
-    mark = f'TMPDIR={tempfile.gettempdir()}\0'.encode()
-    for process in Path('/proc').glob('[0-9]*'):
-        with contextlib.suppress(OSError):  # it has ended, or it is another user's
-            if mark in (process / 'environ').read_bytes() + b'\0':
-                command = (process / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
-                # Those of the standard library end with this process.
-                if 'multiprocessing.' not in command:
-                    found[int(process.name)] = command
-    return found
-
-
 @pytest.fixture
 def no_thread_leak():
-    """Fail a test that leaves a Python thread running for more than two seconds."""
+    """Fail a test that leaves a Python thread running for more than some seconds."""
     before = set(threading.enumerate())
     yield
-    end = time.monotonic() + 2.0
+    end = time.monotonic() + 10.0
     while left := [thread for thread in threading.enumerate() if thread not in before]:
         if time.monotonic() > end:
             frames = sys._current_frames()

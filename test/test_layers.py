@@ -21,7 +21,8 @@ TOP = Path(__file__).resolve().parent.parent
 
 LEVELS = {part: level for level, parts in enumerate((
     ('msg_graph',), ('mddag_executor.errors', 'mddag_executor.memory', 'mddag_executor.defaults',
-                     'mddag_executor.text', 'mddag_executor.results'),
+                     'mddag_executor.text', 'mddag_executor.results',
+                     'mddag_executor.shared_memory'),
     ('mddag_executor.resources', 'mddag_executor.child'),
     ('mddag_executor',),  # its __init__.py, to those who want the version
     ('mddag_executor.core', 'mddag_executor.trace', 'mddag_executor.compiler'),

@@ -30,6 +30,7 @@ from mddag_executor.errors import from_user_code, MddagError, UsageError
 from mddag_executor.hosting.run_options import RunOptions
 from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.text import listed
+from mddag_executor.shared_memory import remove_segments
 
 if TYPE_CHECKING:
     from mddag_executor.hosting.run_here import Display
@@ -191,6 +192,7 @@ def _exit(status: int) -> NoReturn:
     """End the process here, with whatever runs in other threads."""
     sys.stdout.flush()
     sys.stderr.flush()
+    remove_segments()
     os._exit(status)
 
 

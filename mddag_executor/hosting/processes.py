@@ -38,6 +38,7 @@ import json
 import math
 import os
 from pathlib import Path
+import shutil
 import signal
 import subprocess
 import sys
@@ -50,6 +51,7 @@ from mddag_executor.core.tally import of_processes
 from mddag_executor.errors import MddagError
 from mddag_executor.executor.entity import add_counts
 from mddag_executor.executor.session import MATCH_TIMEOUT_S, Session
+from mddag_executor.shared_memory import segments_removed
 from msg_graph import TaskSet
 from msg_graph.binding import Entity
 from msg_graph.drift import drift, Observed, Releases
@@ -112,6 +114,12 @@ class Run:
         if self.status is not None and self.status < 0:
             return f'was ended by signal {-self.status} ({signal.strsignal(-self.status)})'
         return f'ended with status {self.status}'
+
+    def kill(self) -> None:
+        """End it, and remove the middleware's shared memory that it leaves."""
+        with segments_removed(self.process.pid):
+            self.process.kill()
+            self.process.wait()
 
 
 class Supervisor:
@@ -176,7 +184,7 @@ class Supervisor:
         finally:
             for run in self.runs:
                 if run.status is None:
-                    run.process.kill()
+                    run.kill()
                     self._reap(run)
 
     def _start(self, name: str) -> None:
@@ -244,7 +252,7 @@ class Supervisor:
             for run in running:
                 self._print(f'warning: process {run.name} has not ended within '
                             f'{END_TIMEOUT_S:g} s: it is killed', self._err)
-                run.process.kill()
+                run.kill()
                 self._ended(run, now, is_over=True)
 
 
@@ -275,7 +283,10 @@ class Part:
         return cls(Path(folder), **json.loads(Path(folder, 'run.json').read_text()))
 
     def write_result(self, result: Any) -> None:
-        """Store the result of this process in the folder."""
+        """Store the result of this process in the folder, which goes if the run was killed."""
+        if os.getppid() != self.parent:     # nothing else can remove it
+            shutil.rmtree(self.folder, ignore_errors=True)
+            return
         _write(self.folder / f'{os.getpid()}.json', json.dumps(result, default=list))
 
     @staticmethod

@@ -34,6 +34,7 @@ from mddag_executor.hosting.run_result import RunResult
 from mddag_executor.hosting.signals import Signals
 from mddag_executor.laboratory.placement import packed
 from mddag_executor.output_rules import check_output, remove_recording, version_of
+from mddag_executor.shared_memory import segments_removed
 from mddag_executor.simulate.execution_times import draw_execution_times
 from mddag_executor.synthetic.measure import ExecutionPlan
 from msg_graph import TaskSet
@@ -197,7 +198,9 @@ def _probe(
         except subprocess.TimeoutExpired:
             said = 'it has not made its nodes'
         finally:
-            process.kill()
+            with segments_removed(process.pid):
+                process.kill()
+                process.wait()
     names = read_result(folder, process.pid)
     if names is None:
         lines = [line for line in said.splitlines() if line.strip()]

@@ -119,7 +119,7 @@ class CallbackUse(MeasuredUse):
     """How often and how long a callback ran and waited."""
 
     executions: int
-    """Completed executions; of undeclared callbacks all executions."""
+    """Completed executions of its jobs; of undeclared callbacks all executions."""
     busy_ns: int
     """How long it ran in all, without the time in which a coroutine waited."""
     longest_ns: int
@@ -363,7 +363,8 @@ class ReplayResult(ReplayResultRare):
     callbacks: dict[str, CallbackUse]
     """By declared callback how often and how long it ran and waited."""
     undeclared: CallbackUse
-    """The same of all undeclared callbacks together."""
+    """The same of all undeclared callbacks together, and of declared ones that ran without a
+    job."""
     worker_use: WorkerUse
     """How busy the workers were."""
     dropped: dict[str, int]

@@ -62,9 +62,24 @@ class Robot:
             await self.future
 
     def release(self):
+        """Let it end; after that nothing happens."""
         self.let_go.set()
         for future in (self.future, *[*self.client._pending_requests.values()]):
-            future.set_result(None)
+            if not future.done():
+                future.set_result(None)
+
+
+@pytest.fixture
+def make_robot(make_node):
+    """Give a function that makes robots; their callbacks end afterwards, even if a test fails."""
+    robots = []
+
+    def make(how):
+        robots.append(Robot(make_node, how))
+        return robots[-1]
+    yield make
+    for robot in robots:
+        robot.release()
 
 
 def is_noted(path, killed, waits_for):
@@ -83,14 +98,14 @@ def is_noted(path, killed, waits_for):
 @pytest.mark.parametrize('how', ['lock', 'service', 'future'])
 @pytest.mark.parametrize('declared', [True, False], ids=['declared', 'undeclared'])
 def test_a_callback_that_does_not_end_is_named(
-        make_executor, make_node, tmp_path, monkeypatch, how, declared):
+        make_executor, make_robot, tmp_path, monkeypatch, how, declared):
     for module, name in ((unfinished, 'LONG_NS'), (causes, 'HANGS_NS'), (tables, 'LONG_NS'),
                          (diagnostics, 'LONG_NS')):
         monkeypatch.setattr(module, name, 20 * MS)
     monkeypatch.setattr('mddag_executor.sources.imported_run.LEAST_UNFINISHED_NS', 20 * MS)
     monkeypatch.setattr('mddag_executor.analysis.explain.HANGS_NS', 20 * MS)
     path, killed = tmp_path / 'run.mcap', tmp_path / 'killed.mcap'
-    robot = Robot(make_node, how)
+    robot = make_robot(how)
     executor = make_executor(
         loads(GRAPH) if declared else None, trace=str(path), diagnostics_period='10s',
         nodes=[robot.node, robot.free])
@@ -137,11 +152,11 @@ def test_a_callback_that_does_not_end_is_named(
 
 
 def test_what_runs_long_and_ends_is_recorded_once(
-        make_executor, make_node, tmp_path, monkeypatch):
+        make_executor, make_node, make_robot, tmp_path, monkeypatch):
     """Notes of executions that have ended after all, or went on, count for nothing."""
     monkeypatch.setattr(unfinished, 'LONG_NS', 10 * MS)
     path = tmp_path / 'run.mcap'
-    robot = Robot(make_node, 'future')
+    robot = make_robot('future')
     slow = make_node('slow')
     ended = []
 

@@ -22,8 +22,8 @@ from msg_graph.draft import accept, declaration_of
 import pytest
 
 from ..conftest import wait_for_run
-from .conftest import GUESTS, TWO_PROCESSES
-from .helpers import Idle
+from .conftest import GUESTS, TWO_PROCESSES, wait_for
+from .helpers import Idle, segments_of
 
 CHAIN = """\
 mddag: 1
@@ -214,6 +214,32 @@ def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
                for warning in replayed['warnings']), replayed['warnings']
     sink = replayed['dags']['chain']['sinks']['/last:sink']
     assert sink['completed'] > 0 and set(replayed['callbacks']) >= {'/first:relay', '/last:sink'}
+
+
+def test_a_killed_run_leaves_nothing(world, monkeypatch):
+    """Its processes end, and remove the folder of the run."""
+    temporary = world / 'temporary'
+    temporary.mkdir()
+    monkeypatch.setenv('TMPDIR', str(temporary))
+    with running('graph.yaml', *NODES) as run:
+        wait_for_run(run, (world / 'enough').exists)
+        parts = pids(run).values()
+        segments = [path for pid in parts for path in segments_of(pid)]
+        assert len(segments) >= 2 and len([*temporary.iterdir()]) == 1
+        run.kill()
+        run.communicate(timeout=60)     # until they have ended as well
+    assert wait_for(lambda: not any(Path('/proc', str(pid)).exists() for pid in parts), 60.0)
+    assert not [*temporary.iterdir()] and not any(path.exists() for path in segments)
+
+
+def test_synthetic_processes_leave_no_shared_memory(world):
+    """Though they do not destroy their nodes."""
+    with running('graph.yaml', '--synthetic', 'sleep', '--duration', '2s') as run:
+        wait_for_run(run, lambda: sum(len(segments_of(pid)) for pid in pids(run).values()) == 2)
+        segments = [path for pid in pids(run).values() for path in segments_of(pid)]
+        end(run)
+    assert run.returncode == 0
+    assert len(segments) == 2 and not any(path.exists() for path in segments)
 
 
 def test_a_run_that_cannot_begin_leaves_no_trace(world, mddag):

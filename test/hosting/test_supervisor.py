@@ -3,6 +3,7 @@
 """How processes, functions in a process of their own, and a session end; all only pretend."""
 
 import io
+from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import threading
 from mddag_executor.child import ChildError, CrashError, run_child
 from mddag_executor.executor.session import Session
 from mddag_executor.hosting import processes as module
-from mddag_executor.hosting.processes import Supervisor
+from mddag_executor.hosting.processes import Run, Supervisor
 import pytest
 
 from .conftest import has_ended, wait_for
@@ -123,6 +124,50 @@ def test_what_the_child_refuses_is_its_message_and_its_output_is_not_shown(capfd
     expression = '(__import__("os").write(1, b"said"), {2: None})'
     assert run_child('builtins:eval', (expression,), 'it', 60.0) == (4, {2: None})
     assert capfd.readouterr() == ('', '')
+
+
+NODE = """
+import pathlib, sys, time
+import rclpy
+sys.path.insert(0, sys.argv[1])
+from helpers import segments_of
+
+def make_node(seconds):
+    rclpy.init()
+    make_node.node = rclpy.create_node('node')
+    segment, = segments_of('self')
+    print(segment, flush=True)
+    time.sleep(seconds)
+    return segment
+
+if __name__ == '__main__':
+    make_node(60)
+"""
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    """Give the path of `NODE`, which can be imported as `one_node`."""
+    path = tmp_path / 'one_node.py'
+    path.write_text(NODE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, 'argv', ['', str(Path(__file__).parent)])
+    return path
+
+
+def test_a_child_leaves_no_shared_memory(program):
+    """Though it does not destroy its node."""
+    assert not run_child('one_node:make_node', (0,), 'it', 60.0).exists()
+
+
+def test_a_process_that_is_killed_leaves_no_shared_memory(program):
+    with subprocess.Popen(
+            [sys.executable, program, sys.argv[1]], stdout=subprocess.PIPE, text=True) as process:
+        run = Run('it', process)
+        segment = Path(process.stdout.readline().strip())
+        existed = segment.exists()
+        run.kill()
+    assert existed and not segment.exists()
 
 
 @pytest.mark.parametrize('code', [
