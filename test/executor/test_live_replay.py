@@ -114,6 +114,17 @@ def test_an_undeclared_coroutine_is_one_execution_however_often_it_is_resumed(
     assert set(rows['job'].tolist()) == {-1}
 
 
+def has_all_kinds(live):
+    """Return whether something has happened several times in each of the ways that there are."""
+    sinks = {name: sink for dag in live['dags'].values() for name, sink in dag['sinks'].items()}
+    imu = live['dags']['/imu']
+    return (min(dag['jobs'] for dag in live['dags'].values()) > 30
+            and total(live['dags']).missed > 20 and sinks['/fuse:join']['late'] > 3
+            and sinks['/right:watch']['completed'] > 20
+            and imu['ends']['late'] + imu['ends']['dropped'] > 3
+            and sum(live['dropped'].values()) > 3)
+
+
 def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_path):
     """And misses are reported once each; callbacks end just before and after their deadlines."""
     path, misses, waiting = tmp_path / 'live.mcap', [], []
@@ -121,12 +132,16 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
         'detect': lambda: time.sleep(0.002), 'rectify': partial(rectify, waiting),
         'join': every(7, 0.015), 'use': every(9, 0.007), 'tick': every(20, 0.035),
         'show': lambda: time.sleep(random.uniform(0.0, 0.008))})
-    undeclared = nodes.nodes['filter'].create_timer(0.03, lambda: time.sleep(0.001))
+    ticks = []
+    undeclared = nodes.nodes['filter'].create_timer(
+        0.03, lambda: (ticks.append(1), time.sleep(0.001)))
     executor = make_executor(
         loads(GRAPH, 'live.yaml'), num_workers=3, trace=str(path), on_deadline_miss=misses.append)
     with Spinning(executor):
         nodes.start(executor)
-        time.sleep(2.5)
+        assert wait_for(
+            lambda: len(ticks) > 10 and len(misses) > 20 and has_all_kinds(executor.statistics()),
+            60.0)
         nodes.cancel()
         undeclared.cancel()
         assert wait_for(lambda: not waiting and is_idle(executor))
@@ -153,27 +168,19 @@ def test_replay_counts_what_the_executor_counted(make_executor, make_node, tmp_p
     # also for `graph from-trace`: a coroutine is one execution, however often it is resumed
     drafted = {f'{each.node}:{each.name}': each.runs for each in System(path).draft().callbacks()}
     assert drafted['/right:rectify'] == live['callbacks']['/right:rectify']['ran']
-    assert 10 < result['undeclared']['executions'] <= live['undeclared']
+    assert len(ticks) <= result['undeclared']['executions'] <= live['undeclared']
     assert sum(result['dropped'].values()) >= sum(live['dropped'].values())
     reported = sorted((miss.vertex, miss.job) for miss in misses)
     missed = total(live['dags']).missed
     assert len({*reported}) == len(reported)
     # some reported as overdue may have ended in time: their threads could not say so before
-    assert 20 < missed <= len(reported) <= missed + sum(miss.kind == 'overdue' for miss in misses)
+    assert missed <= len(reported) <= missed + sum(miss.kind == 'overdue' for miss in misses)
     dags = open_recording(path).task_set.dags
     recorded = {(dags[event['dag']].vertices[event['vertex']].name, event['job'])
                 for event in read_events(path) if event['_name'] == 'mddag:deadline'}
     certain = {(miss.vertex, miss.job) for miss in misses if miss.kind != 'overdue'}
     assert certain <= recorded <= {*reported} and len(recorded) == missed
 
-    # something happened in each of the ways that there are
-    sinks = {name: sink for dag in live['dags'].values() for name, sink in dag['sinks'].items()}
-    assert min(dag['jobs'] for dag in live['dags'].values()) > 30
-    assert sinks['/fuse:join']['late'] > 3
-    assert sinks['/right:watch']['completed'] > 20
-    imu = live['dags']['/imu']
-    assert imu['ends']['late'] + imu['ends']['dropped'] > 3
-    assert sum(live['dropped'].values()) > 3
     for breakdown, response in breakdowns:
         worst = breakdown['worst']
         assert worst['completed_ns'] - worst['release_ns'] == response['max']
