@@ -128,7 +128,8 @@ class Reading:
         self._buffer = bytearray()  # of a batch
         #: The channels of which messages are wanted, of all known ones; None: all are wanted.
         self._wanted: tuple[set[int], set[int]] | None = None
-        self._skipped: list[Any] = []       # times of messages in chunks that are not unpacked
+        #: By block, in the order of the file, the log times of its messages; None: not wanted.
+        self._times: list[Any] | None = None
 
     def by_file(self) -> Iterator[Batch]:
         """Yield the events in the order of the file."""
@@ -146,12 +147,16 @@ class Reading:
     def messages_of(
         self, topics: Collection[str], times: array[int], summary: Summary | None
     ) -> Iterator[list[Messages]]:
-        """Yield messages of some topics, by channel; add the times of all to ``times``."""
+        """
+        Yield messages of some topics, by channel.
+
+        :param times: receives the times of all messages at the end, in the order of the file.
+        """
+        self._times = []
         known = self._channels.topics
         self._choose(topics, summary)
         for data, at, lengths, channels in self._messages():
             heads = rows_at(data, _TIMES, at + _TIMES_AT)
-            times.frombytes(heads['log_time'].tobytes())
             undefined = channels[~np.isin(channels, list(known))]
             self._undecoded.update(
                 f'channel {channel}: {UNDEFINED}' for channel in undefined.tolist())
@@ -163,7 +168,7 @@ class Reading:
                         known[channel], heads['log_time'][mine], heads['publish_time'][mine],
                         at[mine] + _LEAST, lengths[mine] - records.MESSAGE_HEAD.size, data))
             yield found
-        for each in self._skipped:
+        for each in self._times:
             times.frombytes(each.tobytes())
 
     def _choose(self, topics: Collection[str], summary: Summary | None) -> None:
@@ -182,21 +187,24 @@ class Reading:
 
     def _is_skipped(self, block: Block) -> bool:
         """Return whether no message of a block is wanted, and keep their times then."""
-        if self._wanted is None or block.chunk is None or not block.indexes:
+        if self._times is None or self._wanted is None:
+            return False
+        if block.chunk is None or not block.indexes:
             return False
         wanted, known = self._wanted
         channels = {int.from_bytes(index[:2], 'little') for index in block.indexes}
         if channels & wanted or channels - known:
             return False
         try:
-            times = np.concatenate([
-                np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD)['time']
+            entries = np.concatenate([
+                np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD)
                 for index in block.indexes])
         except ValueError:      # not a number of whole entries
             return False
+        times = entries['time'][np.argsort(entries['offset'], kind='stable')]
         if len(times) and not block.chunk.start <= times.min() <= times.max() <= block.chunk.end:
             return False
-        self._skipped.append(times)
+        self._times.append(times)
         self.chunks += 1
         self.messages += len(times)
         return True
@@ -224,6 +232,8 @@ class Reading:
                     raise Damage(defect.what, block.offset)
                 self.chunks += block.chunk is not None and defect is None
                 self.messages += len(at)
+                if self._times is not None:
+                    self._times.append(rows_at(room, _TIMES, at + _TIMES_AT)['log_time'].copy())
                 places.append((at + size, lengths, channels))
                 size += block.size
                 if defect is not None:
