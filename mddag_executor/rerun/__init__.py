@@ -79,7 +79,9 @@ def rerun(
     find_policy(policy)
     written = [(name, os.fspath(path)) for name, path in (('output', output), ('trace', trace))
                if path is not None]
-    check_distinct([('recording', os.fspath(recording))], written)
+    given = (('recording', recording), ('graph', graph), ('times', times))
+    check_distinct([(name, os.fspath(path)) for name, path in given
+                    if isinstance(path, (str, os.PathLike))], written)
     for _, path in written:
         check_replaced(path, is_kept=True, overwrite=overwrite)
     messages, taken = open_input(
@@ -108,10 +110,13 @@ def compare(
     """
     Return how the outputs of a run differ from those in a bag, topic by topic.
 
+    Damage of the bag is added to the warnings of the result.
+
     :raises mddag_executor.errors.MddagError: when the bag cannot be read.
     """
     with closing(MessageBag(os.fspath(expected))) as recording:
         recording.load(recording.topics)
+        result.warnings += [each for each in recording.warnings if each not in result.warnings]
         return differences(
             result.outputs, recording.messages(recording.topics), result.start_ns, tolerance)
 
@@ -128,4 +133,4 @@ def assert_same(
     if found:
         raise AssertionError('\n'.join(
             [f'the outputs are not those of {os.fspath(expected)}:',
-             *(difference.line() for difference in found)]))
+             *(difference.line() for difference in found), *result.warnings]))

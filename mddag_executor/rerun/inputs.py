@@ -53,6 +53,7 @@ class MessageBag:
     :ivar pauses: from when to when none came (see ``trace.times``).
     :ivar topics: every topic in it.
     :ivar kinds: the type of each topic, as far as it has been loaded.
+    :ivar warnings: what is missing or doubtful, as far as it has been loaded, one line each.
     :raises mddag_executor.sources.kinds.BagError: if there is no bag.
     """
 
@@ -82,7 +83,10 @@ class MessageBag:
         if not wanted:
             return wanted
         self._loaded |= wanted
-        Bag(self.path, sorted(wanted), self.name, self._keep)
+        # contents are read only now, so damage of them is found now
+        for text in Bag(self.path, sorted(wanted), self.name, self._keep).warnings:
+            if text not in self.warnings:
+                self.warnings.append(text)
         self._index.sort(key=itemgetter(0))
         return wanted
 

@@ -197,38 +197,22 @@ class Bag:
         given: dict[int, list[tuple[int, bytes]]] = {}
         waiting = 0
         try:
-            # immutable: reading must not write next to the file
-            with closing(sqlite3.connect(
-                    f'{file.absolute().as_uri()}?immutable=1', uri=True)) as storage:
-                # a view could take for ever
-                storage.execute('PRAGMA trusted_schema = OFF')
-                views = storage.execute(
-                    "SELECT name FROM sqlite_master WHERE type = 'view'").fetchall()
-                if views:
-                    raise ValueError('it has views, which ros2 bag does not write')
-                known = _topics_of(storage)
-                self.topics |= {_absolute(topic.name) for topic in known.values()}
-                wanted = [number for number, topic in known.items()
-                          if _absolute(topic.name) in topics]
-                for number, time, data in storage.execute(
-                        'SELECT topic_id, timestamp, CASE WHEN topic_id IN '
-                        f'({", ".join("?" * len(wanted))}) THEN data END '
-                        'FROM messages ORDER BY id', wanted):
-                    times.append(time)
-                    if data is not None:
-                        if not isinstance(data, bytes):
-                            raise ValueError('the content of a message is none')
-                        self._give(known[number], time, UNKNOWN, data)
-                        given.setdefault(number, []).append((time, data))
-                        waiting += 1
-                    if waiting >= _ROWS:
-                        self._add_rows(known, given)
-                        waiting = 0
-        except Exception as error:      # of SQLite, or caused by damaged data
-            what = f'its SQLite storage cannot be read ({" ".join(str(error).split())})'
+            for number, time, data in _rows_of(file, known, topics):
+                times.append(time)
+                if data is None:
+                    continue
+                self._give(known[number], time, UNKNOWN, data)
+                given.setdefault(number, []).append((time, data))
+                waiting += 1
+                if waiting >= _ROWS:
+                    self._add_rows(known, given)
+                    waiting = 0
+        except _Unreadable as error:
+            what = f'its SQLite storage cannot be read ({error})'
             if not times:
                 raise BagError(called, what, REMEDY) from None
             self.warnings.append(f'{called}: {what}: used {len(times)} messages before that')
+        self.topics |= {_absolute(topic.name) for topic in known.values()}
         self._add_rows(known, given)
         self._look_through(times)
 
@@ -407,6 +391,45 @@ def _unpacked_message(data: bytes, size: int) -> bytes:
         return bytes(packed.stream_reader(io.BytesIO(data)).read(size))
     except zstandard.ZstdError:
         return b''
+
+
+class _Unreadable(Exception):
+    """An SQLite file that is damaged, or that ros2 bag did not write."""
+
+
+def _rows_of(
+    file: Path, known: dict[int, Topic], topics: Collection[str]
+) -> Iterator[tuple[int, int, bytes | None]]:
+    """
+    Yield the messages of an SQLite file: number of the topic, arrival, content if it is wanted.
+
+    :param known: receives the topics by number; ``topics``: absolute names of the wanted ones.
+    :raises _Unreadable: at the first message that cannot be read.
+    """
+    try:
+        # immutable: reading must not write next to the file
+        with closing(sqlite3.connect(
+                f'{file.absolute().as_uri()}?immutable=1', uri=True)) as storage:
+            # a view could take for ever
+            storage.execute('PRAGMA trusted_schema = OFF')
+            views = storage.execute(
+                "SELECT name FROM sqlite_master WHERE type = 'view'").fetchall()
+            if views:
+                raise ValueError('it has views, which ros2 bag does not write')
+            known.update(_topics_of(storage))
+            wanted = [number for number, topic in known.items()
+                      if _absolute(topic.name) in topics]
+            for number, time, data in storage.execute(
+                    'SELECT topic_id, timestamp, CASE WHEN topic_id IN '
+                    f'({", ".join("?" * len(wanted))}) THEN data END '
+                    'FROM messages ORDER BY id', wanted):
+                if not isinstance(time, int):
+                    raise ValueError('the time of a message is none')
+                if not (data is None or isinstance(data, bytes)):
+                    raise ValueError('the content of a message is none')
+                yield number, time, data
+    except Exception as error:      # of SQLite, or caused by damaged data
+        raise _Unreadable(' '.join(str(error).split())) from None
 
 
 def _topics_of(storage: sqlite3.Connection) -> dict[int, Topic]:

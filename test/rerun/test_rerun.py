@@ -3,20 +3,26 @@
 """Nodes run again from a bag: what they see, what they publish, and when."""
 
 import asyncio
+from contextlib import closing
 from functools import cached_property, partial
 import gc
 import os
 import random
+import sqlite3
 import threading
 import uuid
 
 from builtin_interfaces.msg import Time
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from mddag_executor import open_recording, replay
 from mddag_executor.core import Tables
+from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.generate import generate, Options
 from mddag_executor.rerun import assert_same, CallbackFailed, compare, programs, rerun, RerunError
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.inputs import MessageBag, open_input
+from mddag_executor.rerun.message_types import definition
 from mddag_executor.rerun.run import Rerun
 from mddag_executor.simulate import draw_execution_times, periodic_workload, simulate, Workload
 from mddag_executor.simulate import END as ENDS
@@ -32,12 +38,13 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Header, String
 import yaml
 
 from ..executor.conftest import wait_for
+from ..sources.bags import BEGIN, HEADER, header, SQLITE, write
 from .helpers import GRAPH, MS, run_filter, START, write_bag
 
 GAIN = 2.0
@@ -394,6 +401,58 @@ def test_a_failed_run_leaves_the_files_of_before(bag, graph, tmp_path):
     with pytest.raises(CallbackFailed, match='it raised ZeroDivisionError: .* at 0.000000 s'):
         run_filter(bag, graph, lambda node, number: 1 / number, overwrite=True, **files)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def write_chunks(path, count):
+    """Write a bag whose messages are in chunks of their own."""
+    with open(path, 'wb') as file:
+        writer = Writer(file, chunk_size=1)
+        writer.start(profile='ros2')
+        schema = writer.register_schema(
+            'std_msgs/msg/Header', 'ros2msg', definition(Header).encode())
+        channel = writer.register_channel('/points', 'cdr', schema)
+        for i in range(count):
+            at = START + i * 100 * MS
+            writer.add_message(channel, at, serialize_message(Header(frame_id=str(i))), at)
+        writer.finish()
+    return str(path)
+
+
+def test_damage_that_is_found_when_messages_are_loaded_is_said(tmp_path, graph):
+    """The index of a bag does not show it, and messages are missing."""
+    expected, path = (tmp_path / name for name in ('expected.mcap', 'drive.mcap'))
+    write_chunks(path, 20)
+    result = run_filter(path, graph, lambda node, i: node.publisher.publish(String()), fill=(
+        lambda node: setattr(node, 'publisher', node.create_publisher(String, '/filtered', 10))),
+        output=expected)[1]
+    assert result.counts['/filtered'] == 20 and result.warnings == []
+    for damaged in (path, expected):
+        with open(damaged, 'rb') as file:
+            chunks = make_reader(file).get_summary().chunk_indexes
+        data = bytearray(damaged.read_bytes())
+        chunk = chunks[len(chunks) // 2]
+        data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+        damaged.write_bytes(data)
+    seen, again = run_filter(path, graph, lambda node, i: node.note(i))
+    assert 0 < len(seen) < 20
+    assert [text for text in again.warnings if text.startswith(f'{path}: ') and 'chunk' in text]
+    assert compare(result, expected)
+    assert [text for text in result.warnings if text.startswith(f'{expected}: ')]
+
+
+def test_a_topic_that_nodes_cannot_read_is_said_of_each_storage(tmp_path, graph):
+    path = write(tmp_path / 'bag', {'/points': HEADER}, [
+        ('/points', BEGIN + i * MS, header(BEGIN)) for i in range(3)], SQLITE) / 'bag.db3'
+    with closing(sqlite3.connect(path)) as storage, storage:
+        storage.execute("UPDATE topics SET serialization_format = 'json'")
+    with pytest.raises(RerunError, match='/points is encoded as json, which ROS 2 nodes do not'):
+        run_filter(path, graph)
+
+
+def test_no_output_replaces_an_input(bag, graph):
+    for name in ('output', 'trace'):
+        with pytest.raises(UsageError, match=f'it cannot be both graph and {name}: name another'):
+            rerun(bag, graph, [Filter], overwrite=True, **{name: graph})
 
 
 def test_a_callback_that_awaits_asyncio_is_refused(bag, graph):

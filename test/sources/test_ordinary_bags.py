@@ -3,6 +3,7 @@
 """Ordinary bags as releases: all that `ros2 bag record` can write, and damage."""
 
 from contextlib import closing
+import errno
 import gc
 import os
 import random
@@ -336,6 +337,15 @@ def test_messages_are_kept_in_the_order_of_the_file(tmp_path, storage):
     assert kept == [(topic, time) for topic, time in wanted if topic != '/c']
 
 
+@pytest.mark.parametrize('storage', [MCAP, SQLITE])
+def test_what_the_receiver_of_messages_raises_is_no_damage(tmp_path, storage):
+    def keep(*message):
+        raise OSError(errno.ENOSPC, 'No space left on device')
+
+    with pytest.raises(OSError, match='No space left on device'):
+        Bag(write_bag(tmp_path / 'bag', storage), ['/points'], keep=keep)
+
+
 def test_a_pause_has_no_jobs_of_timers(tmp_path):
     outcome = rescheduled(
         tmp_path / 'paused', ARRIVALS[:20] + [time + 3600 * S for time in ARRIVALS[20:]])
@@ -357,6 +367,28 @@ def test_a_clock_that_was_set_back_is_said(tmp_path, storage):
     assert warnings(0, 100, 97.5, 98, 99) == [
         f'{tmp_path / "5"}: the clock was set back by 2.5 s while it was recorded: messages '
         'from before and after that are judged as if they were from one time']
+
+
+@pytest.mark.parametrize('topics', [(), ('/a',), ('/rare',), ('/a', '/b', '/rare')])
+def test_the_clock_was_not_set_back_in_chunks_of_seconds(tmp_path, topics):
+    """The indexes of a chunk are by topic, and not all chunks are unpacked."""
+    def warnings(set_back):
+        path = tmp_path / 'a.mcap'
+        with open(path, 'wb') as file:
+            writer = McapWriter(file, chunk_size=400)
+            writer.start(profile='ros2')
+            schema = writer.register_schema('std_msgs/msg/Header', 'ros2msg', b'')
+            channels = [writer.register_channel(topic, 'cdr', schema)
+                        for topic in ('/a', '/b', '/rare')]
+            for i in range(100):
+                at = BEGIN + i * 500 * MS - (set_back if i >= 50 else 0)
+                writer.add_message(channels[i % 2 if i % 30 else 2], at, bytes(20), at)
+            writer.finish()
+        return Bag(path, topics).warnings
+
+    assert warnings(0) == []
+    text, = warnings(5000 * MS)
+    assert 'the clock was set back by 4.5 s' in text
 
 
 @pytest.mark.parametrize('storage', [MCAP, SQLITE])
