@@ -135,12 +135,13 @@ class Summary(NamedTuple):
     """
     The contents of a file according to its summary section.
 
+    :ivar topics: the topics of all channels; None if not all of them are repeated there.
     :ivar schemas, channels: contents of the records of all schemas and channels.
     """
 
     messages: int
     chunks: int
-    topics: frozenset[str]
+    topics: frozenset[str] | None
     schemas: tuple[bytes, ...]
     channels: tuple[bytes, ...]
 
@@ -344,12 +345,12 @@ def read_summary(stream: BinaryIO, size: int) -> Summary | None:
     statistics = found.get(Opcode.STATISTICS)
     if statistics is None:
         return None
-    messages, chunks = counts_of(Content(statistics[-1]))
+    messages, n_channels, chunks = counts_of(Content(statistics[-1]))
     channels = found.get(Opcode.CHANNEL, [])
-    topics = (Channel.read(Content(each[_NUMBER:])).topic for each in channels)
+    topics = frozenset(Channel.read(Content(each[_NUMBER:])).topic for each in channels)
     return Summary(
-        messages, chunks, frozenset(topics),
-        tuple(found.get(Opcode.SCHEMA, [])), tuple(channels))
+        messages, chunks, topics if len({each[:_NUMBER] for each in channels}) >= n_channels
+        else None, tuple(found.get(Opcode.SCHEMA, [])), tuple(channels))
 
 
 def _summary_records(file: int, position: int, end: int) -> dict[int, list[bytes]]:

@@ -264,7 +264,7 @@ class Trace:
         self.files: list[str] = []
         environment = metadata.environment
         version = tuple(int(environment.get(f'tracer_{part}', '0')[:6]) if environment.get(
-            f'tracer_{part}', '0').isdigit() else 0 for part in ('major', 'minor'))
+            f'tracer_{part}', '0').isdecimal() else 0 for part in ('major', 'minor'))
         #: By how much events may be after the end of their packet: earlier tracers noted it before
         #: the last events.
         self.slack = 0 if version == (0, 0) or version >= (2, 13) else metadata.clock.frequency

@@ -96,15 +96,22 @@ class TraceReader:
         return self._summary.messages if self._summary else None
 
     def may_have(self, name: str) -> bool:
-        """Return whether the file may have an event of that full name; True without a summary."""
+        """Return whether the file may have an event of that full name; True if it does not say."""
         topic = '/trace/' + name.replace(':', '/')
-        return self._summary is None or topic in self._summary.topics
+        topics = self._stated_topics
+        return topics is None or topic in topics
 
     def has_events(self) -> bool:
         """Return whether there are channels of events, not only of other messages."""
-        if self._summary:
-            return any(topic.startswith('/trace/') for topic in self._summary.topics)
+        topics = self._stated_topics
+        if topics is not None:
+            return any(topic.startswith('/trace/') for topic in topics)
         return next(self.events(), None) is not None
+
+    @property
+    def _stated_topics(self) -> frozenset[str] | None:
+        """Return all topics of the file, if its summary has them."""
+        return None if self._summary is None else self._summary.topics
 
     def events(self, names: Iterable[str] | None = None, *,
                sorted: bool = False) -> Iterator[Event]:      # noqa: A002

@@ -100,7 +100,7 @@ def library_of(content: Content) -> str:
     return content.text()
 
 
-def counts_of(content: Content) -> tuple[int, int]:
-    """Return how many messages and chunks a statistics record says, or raise ValueError."""
-    messages, *_, chunks = _STATISTICS.unpack(content.read(_STATISTICS.size))
-    return messages, chunks
+def counts_of(content: Content) -> tuple[int, int, int]:
+    """Return the messages, channels and chunks in a statistics record, or raise ValueError."""
+    messages, _, channels, *_, chunks = _STATISTICS.unpack(content.read(_STATISTICS.size))
+    return messages, channels, chunks

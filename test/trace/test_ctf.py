@@ -149,6 +149,12 @@ def test_ctf2_is_read_as_ctf_1_8(head, order, ids, renamed, tmp_path):
     assert contents(tmp_path / 'ctf2.mcap') == contents(tmp_path / 'ctf1.mcap')
 
 
+def test_a_version_that_is_no_number_is_unknown(tmp_path):
+    folder = session(tmp_path / 's', [START], [(0, 1, 1, 1, 'p', 5, 1)],
+                     environment={'tracer_major': '²'})
+    assert import_ctf(folder, tmp_path / 'out.mcap').events == 1
+
+
 ODD = 'integer { size = %d; align = %d; signed = %d; }'
 CHOICE = """struct { enum : integer { size = 8; } { none, number = 4 ... 6, word = 9 } what_tag;
   variant <what_tag> { struct { } none; integer { size = 32; align = 8; } number; string word; }

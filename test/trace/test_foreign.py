@@ -58,6 +58,16 @@ def test_files_by_the_mcap_package(tmp_path, options):
         assert read(path, in_time_order) == (read_back(recorded), [])
 
 
+@pytest.mark.parametrize('options', [{}, {'repeat_channels': False}], ids=str)
+def test_a_summary_without_channels_does_not_say_what_events_there_are(tmp_path, options):
+    path = tmp_path / 'a.mcap'
+    write_with_mcap(path, mixture(300), **options)
+    reader = TraceReader(path)
+    assert reader.message_count and reader.has_events()
+    assert reader.may_have('ros2:callback_end')
+    assert reader.may_have('other:event') == bool(options)
+
+
 def write_one(path, schema, data, topic='/trace/ros2/callback_end',
               schema_encoding='ros2msg', encoding='cdr', repeat=1):
     with open(path, 'wb') as stream:
