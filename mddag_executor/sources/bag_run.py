@@ -27,6 +27,7 @@ from mddag_executor.recording.losses import Loss, Losses
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import Columns, RELEASES
+from mddag_executor.simulate.workload import MOST_JOBS
 from mddag_executor.sources.bags import Bag
 from mddag_executor.sources.kinds import BagError
 from mddag_executor.text import counted, listed
@@ -34,7 +35,6 @@ from mddag_executor.trace.times import credible
 from msg_graph import Dag, TaskSet
 import numpy as np
 
-_MOST_JOBS = 20_000_000
 _ODD_NS = 5_000_000_000
 """Stamps that are longer before the arrivals are odd."""
 _STAMPS = {
@@ -92,7 +92,7 @@ def _timer_jobs(bag: Bag, period: int) -> Jobs:
     begin = bag.start or 0
     for start, end in bag.stretches:
         first = begin - (begin - start) // period * period
-        if (end - first) // period + count >= _MOST_JOBS:
+        if (end - first) // period + count >= MOST_JOBS:
             raise _too_many(bag)
         found.append(np.arange(first, end + 1, period))
         count += len(found[-1])
@@ -101,7 +101,7 @@ def _timer_jobs(bag: Bag, period: int) -> Jobs:
 
 
 def _too_many(bag: Bag) -> BagError:
-    return BagError(bag.name, f'there are more than {_MOST_JOBS} jobs in it', 'give a shorter bag')
+    return BagError(bag.name, f'there are more than {MOST_JOBS} jobs in it', 'give a shorter bag')
 
 
 def read_bag(
@@ -120,7 +120,7 @@ def read_bag(
         notes.append(f'{dag.name}: {note}')
         parts.append(rows(RELEASES, len(ready), dag=dag.index, job=np.arange(len(ready)),
                           release=release, noticed=ready))
-        if sum(map(len, parts)) > _MOST_JOBS:
+        if sum(map(len, parts)) > MOST_JOBS:
             raise _too_many(bag)
     releases = concatenate(parts)
     if not len(releases):

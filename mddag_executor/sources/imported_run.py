@@ -454,8 +454,10 @@ def process_names(pids: Sequence[int], names: Mapping[tuple[int, int], str]) -> 
     """
     plain = [re.sub('[^A-Za-z0-9_.-]', '_', names.get((pid, pid), '')) or 'process'
              for pid in pids]
-    return [name if plain.count(name) == 1 and name != 'process' else f'{name}_{pid}'
-            for name, pid in zip(plain, pids)]
+    unique = Counter(plain)
+    numbered = {f'{name}_{pid}' for name, pid in zip(plain, pids)}
+    return [name if unique[name] == 1 and name != 'process' and name not in numbered
+            else f'{name}_{pid}' for name, pid in zip(plain, pids)]
 
 
 def _due_times(since: Ints, period: int) -> Ints:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import os
 
+from mddag_executor.errors import UsageError
 from mddag_executor.recording.head import is_declared, ReplayError
 from mddag_executor.recording.mapping import judged_by
 from mddag_executor.recording.recording import Recording
@@ -24,20 +25,25 @@ class Traces:
     """
     The traces of the processes of one run.
 
-    :ivar paths: paths of the traces.
+    :ivar paths: paths of the traces, at least one.
     :ivar offsets: how far the clocks of other machines are ahead of the first trace's clock, ns,
         by the last word of the trace's name (``control`` of ``run.control.mcap``).  Missing
         offsets are estimated from messages.
+    :raises mddag_executor.errors.UsageError: if there is no path.
     """
 
-    paths: Sequence[str]
+    paths: Sequence[str | os.PathLike[str]]
     offsets: Mapping[str, int] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not self.paths:
+            raise UsageError('traces: there is no path: give those of all processes of a run')
+
     def __str__(self) -> str:
-        return ', '.join(self.paths)
+        return ', '.join(os.fspath(path) for path in self.paths)
 
 
-Given = str | os.PathLike[str] | Sequence[str] | Traces | TraceReader
+Given = str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | Traces | TraceReader
 """A trace or its path, or the paths of the traces of all processes of one run."""
 
 
@@ -62,7 +68,8 @@ def open_recording(
     if not isinstance(path, (str, os.PathLike, TraceReader)):
         traces = path if isinstance(path, Traces) else Traces(path)
         from mddag_executor.sources.joining import Joined
-        return judged_by(Joined(traces.paths, traces.offsets).recording(progress), task_set)
+        paths = [os.fspath(each) for each in traces.paths]
+        return judged_by(Joined(paths, traces.offsets).recording(progress), task_set)
     path, reader = _opened(path)
     name = name or path
     if reader is None:

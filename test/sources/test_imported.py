@@ -9,6 +9,7 @@ from mddag_executor.analysis.communications import recorded_callbacks
 from mddag_executor.analysis.drafting import System
 from mddag_executor.recording.columns import rows, Table
 from mddag_executor.recording.tables import EXECUTIONS, UNKNOWN
+from mddag_executor.sources.imported_run import process_names
 from msg_graph import load, loads
 import numpy as np
 import pytest
@@ -476,3 +477,9 @@ def test_a_draft_has_the_recorded_processes(three_processes, call, tmp_path):
     assert [each.name for each in load(graph).processes] == ['cam', 'det', 'hog']
     assert [each.name for each in open_recording(three_processes, load(graph)).run.placed] == [
         'cam', 'det', 'hog']
+
+
+def test_processes_have_different_names():
+    names = {(5, 5): 'a_12', (12, 12): 'a', (13, 13): 'a', (14, 14): 'b c'}
+    assert process_names([5, 12, 13, 14, 15], names) == [
+        'a_12_5', 'a_12', 'a_13', 'b_c', 'process_15']

@@ -3,11 +3,13 @@
 """The traces of several processes as one run."""
 
 import json
+from pathlib import Path
 
-from mddag_executor import replay, ReplayError, reschedule
+from mddag_executor import replay, ReplayError, reschedule, Traces
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
+from mddag_executor.errors import UsageError
 from mddag_executor.recording.columns import rows
 from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.tables import RELEASES
@@ -60,6 +62,15 @@ def test_a_job_goes_on_in_the_other_trace(tmp_path, late, boot):
     executions = outcome.recording.executions.records()
     assert len(releases) == len(outcome.recording.releases) == 3
     assert [(row['dag'], row['job']) in releases for row in executions] == [True] * 6
+
+
+def test_traces_are_named_by_paths_of_any_kind(tmp_path):
+    paths = [Path(each.end(100 * MS)) for each in pair(tmp_path)]
+    for given in (paths, Traces(paths)):
+        assert replay(given).result()['dags']['chain']['jobs'] == 1
+    for none in ([], ()):
+        with pytest.raises(UsageError, match='there is no path: give those of all processes'):
+            replay(none)
 
 
 @pytest.mark.parametrize(('where', 'cause'), [('down', 'interpreter'), ('up', 'machine')])
