@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
+from mddag_executor.hosting.run_options import number_of_processes
 
 if TYPE_CHECKING:
     from mddag_executor.analysis.as_recorded import Replay
@@ -59,8 +60,7 @@ def _overheads(text: str) -> int | None:
 
 def check(args: argparse.Namespace) -> None:
     """Check the options that depend on each other."""
-    if args.processes == '0':
-        raise UsageError('--processes 0: give 1 or more, or a file')
+    number_of_processes(args.processes)
     if args.reschedule:
         if args.end is not None:
             raise UsageError('--to: the scheduler runs to the end of a recording: leave it or '
@@ -202,11 +202,11 @@ def _processes(
 ) -> Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None:
     """Return a function that says which node runs in which process, as `--processes` says."""
     from msg_graph.edit import load_processes
-    given = args.processes
-    if given is None:
+    count = number_of_processes(args.processes)
+    if args.processes is None:
         return None
-    if given.isdecimal():
+    if count is not None:
         from mddag_executor.laboratory.placement import packed
-        return lambda task_set, times: packed(task_set, int(given), times)
-    name, text = common.read_text(given)
+        return lambda task_set, times: packed(task_set, count, times)
+    name, text = common.read_text(args.processes)
     return lambda task_set, times: load_processes(text, name, task_set)

@@ -53,8 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--fail-under', type=options.positive_float, metavar='FACTOR',
         help='exit with status 1 if the factor of a callback is smaller, if a deadline is missed '
         'already, or if no job was due')
-    add('--report', metavar='OUT.html', type=options.Output,
-        help="write the tables with bars as one HTML file ('-': to standard output)")
+    options.add(parser, '--report', help="write the tables with bars as one HTML file "
+                "('-': to standard output)")
     options.add(parser, '--from', '--json')
 
 

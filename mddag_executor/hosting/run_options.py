@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Spec = str | Callable[[], Any]
 """A SPEC as on the command line, or the function or class itself."""
 MODES = ('sleep', 'spin', 'native', 'mixed')
+_MOST_DIGITS = 9
 
 
 def option(default: Any, meaning: str = '', *, of_the_run: bool = False, **how: Any) -> Any:
@@ -123,9 +124,8 @@ class RunOptions:
             self._set('trace', os.fspath(self.trace))
         if self.processes is not None:
             self._set('processes', str(self.processes))
-        if self.n_processes == 0:
-            raise UsageError('--processes 0: give 1 or more, or a file')
-        if self.process is not None and self.n_processes is not None:
+        n_processes = self.n_processes
+        if self.process is not None and n_processes is not None:
             raise UsageError(f'--process {self.process}: with --processes {self.processes} no '
                              'process has a name of its own: name a file')
         needs_graph = next((name for name in ('synthetic', 'processes', 'process')
@@ -143,8 +143,7 @@ class RunOptions:
     @property
     def n_processes(self) -> int | None:
         """Return the number of processes that is given; None: none is, or a file is."""
-        given = self.processes
-        return int(given) if isinstance(given, str) and given.isdecimal() else None
+        return number_of_processes(None if self.processes is None else str(self.processes))
 
     @property
     def seconds(self) -> float | None:
@@ -171,6 +170,7 @@ class RunOptions:
         """
         from msg_graph import EMPTY_TASK_SET, load
         from msg_graph.edit import load_processes, with_processes
+        from msg_graph.yamltext import decode
         if self.graph is None:
             task_set = EMPTY_TASK_SET
         elif isinstance(self.graph, (str, os.PathLike)):
@@ -179,7 +179,7 @@ class RunOptions:
             task_set = self.graph
         if self.processes is not None and self.n_processes is None:
             name = str(self.processes)
-            text = Path(name).read_text(encoding='utf-8')
+            text = decode(Path(name).read_bytes(), name)
             return with_processes(task_set, load_processes(text, name, task_set))
         if self.n_processes is not None and task_set.processes:
             return replace(task_set, processes=())
@@ -200,6 +200,21 @@ class RunOptions:
             return None
         check_output(os.fspath(self.trace), is_kept=True, overwrite=self.overwrite)
         return Path(self.trace).absolute()
+
+
+def number_of_processes(given: str | None) -> int | None:
+    """
+    Return the number that `--processes N|FILE` gives; None: none is given, or a file is.
+
+    :raises UsageError: if it is 0, or more than any declaration has nodes.
+    """
+    if given is None or not (given.isascii() and given.isdecimal()):
+        return None
+    digits = given.lstrip('0')
+    if not digits or len(digits) > _MOST_DIGITS:
+        raise UsageError(f'--processes {given[:2 * _MOST_DIGITS]}: '
+                         f'give {"fewer" if digits else "1 or more"}, or a file')
+    return int(digits)
 
 
 def spec_of(target: Any) -> str:
