@@ -10,7 +10,11 @@ from typing import Any, NamedTuple, TypeVar
 
 from mddag_executor.core.state import State
 from mddag_executor.core.tables import processes_of, Tables
+from mddag_executor.errors import UsageError
 from msg_graph import TaskSet
+
+MOST_JOBS = 20_000_000
+"""With more jobs a load does not fit into the memory of usual machines."""
 
 # The fate of an execution: it runs, fails at its end, or does not run and its job expires.
 RUNS, FAILS, SKIPPED = range(3)
@@ -104,7 +108,15 @@ def edge_numbers(tables: Tables) -> dict[tuple[int, int], int]:
 def periodic_workload(
     task_set: TaskSet, times: Sequence[Sequence[int]], duration_ns: int
 ) -> Workload:
-    """Return the workload of releases at k*T from 0, with the same execution times in each job."""
+    """
+    Return the workload of releases at k*T from 0, with the same execution times in each job.
+
+    :raises mddag_executor.errors.UsageError: if it has more than ``MOST_JOBS`` jobs.
+    """
+    if sum(dag.jobs_in(duration_ns) for dag in task_set.dags) > MOST_JOBS:
+        raise UsageError(
+            f'{task_set.file}: it has more than {MOST_JOBS} jobs in {duration_ns / 1e9:g} s: '
+            'give a shorter --duration')
     releases = sorted(
         (job * dag.period_ns, dag.index, job)
         for dag in task_set.dags

@@ -15,11 +15,11 @@ from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor import defaults
 from mddag_executor.analysis.as_recorded import recording_result, Replay
 from mddag_executor.analysis.usage import share
 from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, processes_of, Tables, Tally
 from mddag_executor.core.tables import DEMOTE, ON_LATE
-from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
 from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import Head, ReplayError
@@ -28,6 +28,7 @@ from mddag_executor.recording.tables import Columns, UNKNOWN
 from mddag_executor.simulate import LogEntry, schedule, Settings
 from mddag_executor.simulate.execution_times import with_execution_times
 from mddag_executor.simulate.policies import ALL_POLICIES, preempts, ROS2
+from mddag_executor.simulate.run import check
 from mddag_executor.simulate.workload import SKIPPED
 from mddag_executor.sources.open import Given, open_recording, Progress, undeclared
 from mddag_executor.text import counted, listed
@@ -216,19 +217,21 @@ def reschedule(
     :raises mddag_executor.trace.TraceError: if the file is not a trace.
     :raises mddag_executor.ReplayError: if the trace has nothing to replay, none of the
         declaration's callbacks, or an execution time that is neither recorded nor declared.
-    :raises mddag_executor.errors.MddagError: for an invalid policy or number of workers.
+    :raises mddag_executor.errors.MddagError: for an invalid policy, number of workers or CPUs, or
+        overhead.
     """
     if policy is not None:
         preempts(policy, preemptive or False)
-    if workers is not None and not 1 <= workers <= MOST_WORKERS:
-        raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
+    check(Settings(workers=defaults.WORKERS if workers is None else workers, cpus=cpus,
+                   dispatch_overhead_ns=dispatch_overhead))
     run = path if isinstance(path, Recording) else path() if callable(path) else open_recording(
         path, task_set, name, progress)
     if run.task_set is EMPTY_TASK_SET:
         raise undeclared(run.name, run.run.imported)
     head, each, given = run.run.head, run.run.workers_each, policy
     policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
-    cpus = cpus or head.cpus or None
+    if cpus is None:
+        cpus = head.cpus if head.cpus > 0 else None
     if preemptive is None:
         preemptive = head.preemptive and policy != ROS2
     if on_late is None:     # any other number is damage

@@ -27,6 +27,7 @@ from mddag_executor.simulate import (
 )
 from mddag_executor.whatif.run_writer import write_trace
 from msg_graph import load, loads
+from msg_graph.duration import DAY
 import pytest
 
 from ..conftest import examples
@@ -173,6 +174,11 @@ def test_utilisation_and_its_scaling():
             scale_execution_times(two_dags(), times, 2, target)
     with pytest.raises(UsageError, match='so there is nothing to scale'):
         scale_execution_times(two_dags(), [[0, 0], [0, 0]], 2, 0.5)
+
+
+def test_more_jobs_than_fit_into_memory_are_refused():
+    with pytest.raises(UsageError, match='more than 20000000 jobs in 86400 s: give a shorter'):
+        periodic_workload(two_dags(), [[1, 1], [1, 1]], DAY)
 
 
 # Both are late, at once.

@@ -176,9 +176,11 @@ def test_settings_that_can_not_be(tmp_path):
     path = write_two(tmp_path / 'a.mcap')
     with pytest.raises(PolicyError, match="policy 'best'"):
         reschedule(path, policy='best')
-    for workers in (0, 10**9):
-        with pytest.raises(UsageError, match='give 1 to'):
-            reschedule(path, workers=workers)
+    for name, value, says in (('workers', 0, 'give 1 to'), ('workers', 10**9, 'give 1 to'),
+                              ('cpus', 0, 'give at least 1'),
+                              ('dispatch_overhead', -1, 'give 0 or more')):
+        with pytest.raises(UsageError, match=says):
+            reschedule(path, **{name: value})
     for policy, workers, says in (('newest', 2, "policy 'newest'.*give --policy"),
                                   ('rad', 2**31 - 1, '2147483647 workers: give --workers'),
                                   ('rad', -3, '-3 workers')):
