@@ -8,7 +8,7 @@ Theory of operation
 1. Deadlines belong to callbacks: all vertices of a callback have its deadline.
 2. In the text only the values of ``deadline:`` change; a callback without one gets a new line, or
    a new entry in its braces.  New ``processes:`` are the last entry.  Comments outside of it,
-   order and layout stay.
+   order, layout and the ends of lines stay.
 3. The new text must give the task set with only that change; else an error is raised.  (A value
    may be an alias of another one.)
 """
@@ -95,7 +95,7 @@ def _with_deadlines(text: str, deadlines: Table[str, int]) -> str:
         else:
             # Before the second key, which begins a line; preferably before a later one.
             begin = callback.value[min(2, len(callback.value) - 1)][0].start_mark
-            line = ' ' * begin.column + f'deadline: {value}\n'
+            line = ' ' * begin.column + f'deadline: {value}{_line_end(text)}'
             edits.append((begin.line, 0, 0, line))
     for row, first, last, new in sorted(edits, reverse=True):
         lines[row] = lines[row][:first] + new + lines[row][last:]
@@ -139,6 +139,12 @@ def _with_entry(text: str, file: str, processes: tuple[Process, ...]) -> str:
         while not lines[end - 1].partition('#')[0].strip():     # comments on what follows
             end -= 1
         del lines[begin:end]
+    line_end = _line_end(text)
     if lines and not lines[-1].endswith('\n'):
-        lines[-1] += '\n'
-    return ''.join(lines) + processes_text(processes)
+        lines[-1] += line_end
+    return ''.join(lines) + processes_text(processes).replace('\n', line_end)
+
+
+def _line_end(text: str) -> str:
+    """Return what the lines of a text end with."""
+    return '\r\n' if '\r\n' in text else '\n'

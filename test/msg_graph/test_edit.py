@@ -135,3 +135,14 @@ def test_nodes_that_no_process_names_run_in_the_first():
                        ('[1]', 'p.yaml:1: the file: a list is not a mapping')):
         with pytest.raises(GraphError, match=says):
             load_processes(text, 'p.yaml', tasks)
+
+
+def test_lines_end_as_they_did():
+    text = HEAD.replace('\n', '\r\n')
+    for placed in (with_processes(loads(each), (Process('x', ('/a', '/b', '/c')),))
+                   for each in (text, text + 'workers: 3')):
+        assert placed.text.count('\n') == placed.text.count('\r\n') > text.count('\n')
+    text = TEXT.replace('      deadline: 7ms\n', '').replace('\n', '\r\n')
+    task_set = load_with_or_without_deadlines(text, 'g.yaml')
+    result = deadlines_in_text(task_set, {'/n:z': 8_000_000})
+    assert result.count('\n') == result.count('\r\n') == text.count('\n') + 1
