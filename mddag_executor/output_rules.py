@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 import os
 from pathlib import Path
 import stat
@@ -96,8 +97,7 @@ def whole_file(path: str) -> Iterator[BinaryIO]:
             raise
         return
     target = Path(os.path.realpath(path))  # a symbolic link stays one
-    begin = os.fsdecode(os.fsencode(target.name)[:200])     # a name may have 255 bytes
-    part = target.with_name(f'.{begin}.{os.getpid()}.part')
+    part = _name_of_part(target)
     try:
         with part.open('xb') as file:
             yield file
@@ -112,6 +112,16 @@ def whole_file(path: str) -> Iterator[BinaryIO]:
         if isinstance(error, OSError) and error.filename in (None, str(part)):
             error.filename = path  # a full disk, or the folder
         raise
+
+
+def _name_of_part(target: Path) -> Path:
+    """Return a new name for a temporary file next to a file."""
+    begin = os.fsdecode(os.fsencode(target.name)[:200])     # a name may have 255 bytes
+    for number in count():
+        part = target.with_name(f'.{begin}.{os.getpid()}-{number}.part')
+        if not os.path.lexists(part):   # one of a killed process, perhaps of another container
+            return part
+    raise AssertionError
 
 
 def check_results(folder: Path, names: Collection[str]) -> None:

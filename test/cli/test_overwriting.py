@@ -78,6 +78,14 @@ def test_a_failed_output_leaves_what_was_there(tmp_path):
     assert path.read_bytes() == b'before' and os.listdir(tmp_path) == ['out.bin']
 
 
+def test_a_killed_process_with_the_same_number_may_have_left_a_file(tmp_path):
+    """Each process of a container may have the same one."""
+    out, left = tmp_path / 'out.json', tmp_path / f'.out.json.{os.getpid()}-0.part'
+    left.write_text('half')
+    common.write_json(str(out), {})
+    assert sorted(tmp_path.iterdir()) == [left, out] and left.read_text() == 'half'
+
+
 def test_an_output_keeps_links_and_permissions(tmp_path):
     target, link = tmp_path / ('é' * 127), tmp_path / 'link'     # as long as a name may be
     target.write_text('before')
