@@ -66,7 +66,7 @@ class Requirements:
                 flows = self._paths.flows(number)
                 rules = Rules(self._recording.task_set, path)
                 for what, required in path.requirements.items():
-                    judge = self._reactions if what == 'reaction' else self._ages
+                    judge = {'reaction': self._reactions, 'age': self._ages}[what]
                     found[number, what] = judge(flows, rules, required)
         return found
 

@@ -25,7 +25,6 @@ mddag export run.mcap graph.yaml -o jobs.csv --rows jobs
 mddag export run.mcap -o executions.parquet --from 90s --to 100s
 mddag export run.mcap -o tables/"""
 
-FORMS = ('pftrace', 'csv', 'parquet')
 _TABLES = 'tables'
 
 
@@ -69,6 +68,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _form(args: argparse.Namespace) -> str:
+    from mddag_executor.report.export import FORMS
     form = 'csv' if args.output == '-' else PurePath(args.output).suffix[1:].lower()
     if args.output.endswith('/'):
         form = _TABLES

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import csv
 import io
 from pathlib import Path
@@ -74,6 +74,12 @@ def write_parquet(file: BinaryIO, columns: Sequence[Column]) -> None:
     pyarrow.parquet.write_table(arrow_table(columns), file, compression='zstd')
 
 
+TABLE_FORMS: dict[str, Callable[[BinaryIO, Sequence[Column]], None]] = {
+    'csv': write_csv, 'parquet': write_parquet}
+"""By form (the end of a file's name) what writes the executions or jobs of a recording."""
+FORMS = ('pftrace', *TABLE_FORMS)
+
+
 def table_files() -> frozenset[str]:
     """Return the names of the files that ``write_tables`` writes."""
     return frozenset(f'{name}.parquet' for name in (*TABLES, *result_tables()))
@@ -100,10 +106,13 @@ def check_available(form: str) -> None:
 
 
 def write(form: str, file: BinaryIO, replay: Replay, rows: str) -> None:
-    """Write a recording's executions or jobs (``rows``) as csv or parquet, or all as pftrace."""
+    """
+    Write a recording in one of the ``FORMS``.
+
+    :param rows: of a table: ``executions`` or ``jobs``; a pftrace has both.
+    """
     if form == 'pftrace':
         from mddag_executor.report.perfetto import write_perfetto
         write_perfetto(file, replay)
     else:
-        columns = executions(replay)[0] if rows == 'executions' else jobs(replay)
-        {'csv': write_csv, 'parquet': write_parquet}[form](file, columns)
+        TABLE_FORMS[form](file, executions(replay)[0] if rows == 'executions' else jobs(replay))
