@@ -225,7 +225,6 @@ class Matching:
     Maps the callbacks of an imported recording to declared ones.
 
     :param names: the nodes and callbacks of the recording.
-    :param threads: the processes and threads that ran callbacks.
     :param judge: the judging declaration; None: none.
     """
 

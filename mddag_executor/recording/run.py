@@ -27,8 +27,9 @@ class Run:
     :ivar same: whether the run itself was judged by ``task_set``.
     :ivar start: the first release, or when the first execution became ready, ns; None: neither.
     :ivar end: the end of the run, ns; ``shut_down``: whether it is recorded.
+    :ivar judged: whether jobs that are open at the end are judged.
     :ivar judged_until: when the run was judged, ns: what was open then and past its deadline
-        missed it.
+        missed it; ``judged_order``: the position of this in the order.
     :ivar judge_from: the first judged release, ns; -NEVER: all are judged.
     :ivar judged_releases: range of judged releases, ns; None: all.
     :ivar hosted: changes of the vertices of a DAG that the process runs, by position in the order.
