@@ -22,7 +22,7 @@ from typing import Any
 
 from mddag_executor import defaults
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import Progress, run_program, say, table
+from mddag_executor.cli.text import is_quiet, Progress, run_program, say, table
 from mddag_executor.errors import MddagError
 from mddag_executor.report.tables import percent
 from mddag_executor.resources import find
@@ -88,7 +88,8 @@ def _step(
     sys.stdout.flush()
     # Of this machine only: the demo must not find another one's nodes, nor be found by them.
     done = run_program(
-        [sys.executable, '-m', 'mddag_executor', *words, '--json', str(result)],
+        [sys.executable, '-m', 'mddag_executor', *words, '--json', str(result),
+         *['--quiet'] * is_quiet()],
         f'mddag {words[0]}', seconds,
         environment={'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', **os.environ})
     errors = done.stderr.decode()

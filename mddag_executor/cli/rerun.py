@@ -12,7 +12,7 @@ import sys
 from typing import BinaryIO, TYPE_CHECKING
 
 from mddag_executor.cli import common, options
-from mddag_executor.cli.text import printable, Progress, warn
+from mddag_executor.cli.text import is_quiet, printable, Progress, warn
 from mddag_executor.text import counted, listed
 
 if TYPE_CHECKING:
@@ -68,8 +68,10 @@ def main(args: argparse.Namespace) -> int:
         os.stat(args.expect)  # now, not after the run
     args.ros_args = args.ros_args or []
     _fix_hashes()
+    from mddag_executor.hosting.initialised import quiet_log
     # With `--json -` what nodes print must not get into the JSON.
-    with redirect_stdout(sys.stdout if common.wants_tables(args) else sys.stderr):
+    with quiet_log(is_quiet()), redirect_stdout(
+            sys.stdout if common.wants_tables(args) else sys.stderr):
         result, found = _run(args)
     warn(*result.warnings)
     values = result.result(found)

@@ -87,13 +87,17 @@ def options_of(args: argparse.Namespace) -> RunOptions:
 
 def main(args: argparse.Namespace) -> int:
     from mddag_executor.executor.settings import diagnostics_period_ns
-    from mddag_executor.hosting.run_nodes import run_with
+    from mddag_executor.hosting.initialised import quiet_log
     diagnostics_period_ns(args.diagnostics)
     if args.graph is None and args.fail_on_miss:
         raise UsageError('--fail-on-miss: without a GRAPH no deadline is judged: give one')
+    with quiet_log(is_quiet()):
+        return part(args) if args.part is not None else _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from mddag_executor.hosting.run_nodes import run_with
     given = options_of(args)
-    if args.part is not None:
-        return part(args, given)
     if args.graph is not None:
         given = replace(given, graph=common.load_graph(args.graph))
     if args.processes == '-':
@@ -155,7 +159,7 @@ def _incomplete(traces: list[Any]) -> MddagError | None:
     return MddagError(errors[0]) if errors else None
 
 
-def part(args: argparse.Namespace, given: RunOptions) -> int:
+def part(args: argparse.Namespace) -> int:
     """Run one process of several, and write its result to the folder of the run."""
     from mddag_executor.hosting.host import nodes_of
     from mddag_executor.hosting.initialised import initialised
@@ -166,7 +170,7 @@ def part(args: argparse.Namespace, given: RunOptions) -> int:
     the_part = Part.read(args.part)
     belong_to_parent(the_part.parent)
     task_set: TaskSet = loads(the_part.text, name=args.graph)
-    given = given.of_part(the_part.options, task_set)
+    given = options_of(args).of_part(the_part.options, task_set)
     if given.process is None:
         def then(names: list[list[str]]) -> NoReturn:
             the_part.write_result(names)

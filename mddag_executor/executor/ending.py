@@ -95,11 +95,10 @@ class Ending:
             self._recorder.close(now, end)
 
     def close(self) -> None:
-        """Close the descriptors, once the run has ended and no thread uses them."""
+        """Close the descriptors, once the run has ended and no thread uses them any more."""
         with self._lock:
             if self._has_ended and self.is_asked:
-                with self._pool.lock:  # another thread may be in ``WorkerPool.pause``
-                    self._close_descriptors()
+                self._pool.close_descriptors(self._close_descriptors)
 
     def _close_descriptors(self) -> None:
         if self.spin_once_epoll is not None:

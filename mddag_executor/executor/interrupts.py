@@ -16,7 +16,9 @@ Theory of operation
     Otherwise it *defers* the call until the spin waits, or ends.
 3.  A second SIGINT is not deferred: the first may have come to a callback that never ends, while
     the callback called the executor.  For this case, other signals are repeated every ``REPEAT_S``
-    as long as they are deferred, and called as soon as one of them comes to a callback.
+    as long as they are deferred, and called as soon as one of them comes to a callback.  A
+    repetition that is on its way when the call is made counts as handled by that call
+    (``_Deferred._undefer``), and none is on its way when a handler is restored.
 4.  If rclpy itself handles a signal, nothing is replaced: its handler is written in C, and ends
     the context, so the program cannot spin again.
 """
@@ -26,6 +28,7 @@ from __future__ import annotations
 import _thread
 from collections.abc import Callable
 from importlib import import_module
+import os
 import select
 import signal
 import sys
@@ -69,19 +72,28 @@ class _Deferred:
 
     :ivar originals: the handlers that it replaces, by signal.
     :ivar pending: the signals whose handlers are still to be called, in their order.
+    :ivar may_repeat: whether pending signals may be sent to the main thread again.
     """
 
     def __init__(self) -> None:
         self.originals: dict[int, Any] = {}
         self.pending: dict[int, bool] = {}
+        self.may_repeat = True
+        # the threads that may be about to send a signal
+        self._sending: set[object] = set()
+        # the signals whose repetitions are being awaited
+        self._awaited: set[int] = set()
+        os.register_at_fork(after_in_child=self._sending.clear)
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         """Call the original handler, or defer that."""
+        if number in self._awaited:
+            return
         is_second = number in self.pending
         if _may_interrupt(frame) or is_second and (
                 number == signal.SIGINT or _is_in_callback(frame)):
-            self.pending.pop(number, None)
-            self.originals[number](number, frame)
+            if not is_second or self._undefer(number):
+                self.originals[number](number, frame)
         elif not is_second:
             self.pending[number] = True
             if number != signal.SIGINT:
@@ -89,10 +101,36 @@ class _Deferred:
                 _thread.start_new_thread(self._repeat, (number,))
 
     def _repeat(self, number: int) -> None:
+        """Send a signal to the main thread again and again, while its handler is deferred."""
+        me = object()
         time.sleep(REPEAT_S)
         while number in self.pending:
-            signal.pthread_kill(threading.main_thread().ident or 0, number)
+            self._sending.add(me)  # before the last look: see ``await_repetitions``
+            if self.may_repeat and number in self.pending and number not in self._awaited and (
+                    _signal.getsignal(number) == self.handle):
+                signal.pthread_kill(threading.main_thread().ident or 0, number)
+            self._sending.discard(me)
             time.sleep(REPEAT_S)
+
+    def await_repetitions(self) -> None:
+        """Wait until Python has called ``handle`` for each signal that ``_repeat`` has sent."""
+        while self._sending:
+            time.sleep(0)
+        # The kernel delivers a signal at the end of a system call at the latest, and Python calls
+        # its handler where a loop begins again.
+        for _ in range(3):
+            time.sleep(0)
+
+    def _undefer(self, number: int) -> bool:
+        """End the deferral of a signal; return whether its original handler is to be called."""
+        if number == signal.SIGINT:  # it is not repeated
+            return self.pending.pop(number, False)
+        self._awaited.add(number)
+        try:
+            self.await_repetitions()
+            return self.pending.pop(number, False)  # a handler of another one may have called it
+        finally:
+            self._awaited.discard(number)
 
     def call_pending(self) -> None:
         """Call the original handlers now whose calls were deferred."""
@@ -100,7 +138,7 @@ class _Deferred:
         if numbers:
             try:
                 # unless a second one has come meanwhile, whose handler was called at once
-                if self.pending.pop(numbers[0], False):
+                if self._undefer(numbers[0]):
                     self.originals[numbers[0]](numbers[0], sys._getframe())
             finally:
                 self.call_pending()
@@ -161,11 +199,24 @@ class InterruptsDeferred:
         """Restore the handlers, and call those that were deferred."""
         if threading.current_thread() is not threading.main_thread():
             return
-        for number in reversed(self._replaced):
-            if _signal.getsignal(number) == _deferred.handle:
-                _signal.signal(number, _deferred.originals[number])
+        try:
+            _deferred.may_repeat = False
+            if _deferred.pending:
+                _deferred.await_repetitions()
+            self._restore()
+        except BaseException:  # a second SIGINT, which is not deferred
+            self._restore()
+            raise
         if _deferred.pending:
             _deferred.call_pending()
+
+    def _restore(self) -> None:
+        for number in reversed(self._replaced):
+            if _signal.getsignal(number) == _deferred.handle:
+                if number == signal.SIGINT:  # the last one; after that it may interrupt this
+                    _deferred.may_repeat = True
+                _signal.signal(number, _deferred.originals[number])
+        _deferred.may_repeat = True
 
 
 def _is_to_be_deferred(number: int, handler: Any) -> bool:

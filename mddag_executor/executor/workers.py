@@ -158,6 +158,7 @@ class WorkerPool:
         self._bell_rings = self._has_called = False
         self._closed = False
         self._at_end: Callable[[], None] = _nothing
+        self._close: Callable[[], None] = _nothing
         self._leaving = False
         self._all_left = threading.Event()
         #: whether the thread of a ``spin_once`` runs everything
@@ -385,6 +386,22 @@ class WorkerPool:
             then, self._at_end = self._at_end, _nothing
         then()
 
+    def close_descriptors(self, close: Callable[[], None]) -> None:
+        """
+        Call a function that closes the descriptors, once no thread waits for one; it has the lock.
+
+        The kernel wakes parked threads one after the other, and none any more once the descriptor
+        that wakes them is closed.
+        """
+        with self.lock:
+            self._close = close
+            self._close_descriptors()
+
+    def _close_descriptors(self) -> None:
+        if not self._n_parked and not self.polling:
+            close, self._close = self._close, _nothing
+            close()
+
     @staticmethod
     def _join(each: WorkerThread, deadline: int | None) -> bool:
         thread = each.thread
@@ -442,6 +459,7 @@ class WorkerPool:
                     self.become(me, ThreadState.PARKED)
                 self._n_parked -= me.state is ThreadState.PARKED
                 is_last = self._closed and not self._threads
+                self._close_descriptors()
             if is_last:
                 self._all_have_ended()
 
@@ -456,7 +474,8 @@ class WorkerPool:
                 execute()
                 found = go_on(me)
             elif me.state is _PARKED:
-                park()
+                if not self._closed:
+                    park()
                 if self._closed:
                     return
                 found = receive(me, None)

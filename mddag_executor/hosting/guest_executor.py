@@ -61,8 +61,8 @@ class HostOfExecutors(Protocol):
     ) -> None:
         """Wait until a condition is true, the run or the program ends, or the timeout is over."""
 
-    def take_interrupt(self, guest: Guest | None) -> bool:
-        """Return whether the calling thread is that of a main which a SIGINT has interrupted."""
+    def raise_interrupt(self, guest: Guest | None) -> None:
+        """Raise KeyboardInterrupt if a SIGINT has interrupted the main of the calling thread."""
 
     def note_interrupt(self) -> None:
         """Note a KeyboardInterrupt in the main thread."""
@@ -144,8 +144,7 @@ class GuestExecutor:
         if self.guest is None and self.is_global:  # for rclpy.spin_once in a callback
             timeout_sec = _STEP_S
         if self.guest is not None and self.host.is_over(self.guest):
-            if self.host.take_interrupt(self.guest):
-                raise KeyboardInterrupt
+            self.host.raise_interrupt(self.guest)
             raise ExternalShutdownException()
         self._wait(until, timeout_sec, is_step=True)
 
@@ -195,11 +194,10 @@ class GuestExecutor:
         raised: list[BaseException] = []
 
         def is_over() -> bool:
-            if not raised:  # each error comes out of one spin
-                if self._errors:
-                    raised.append(self._errors.popleft())
-                elif self.host.take_interrupt(self.guest):
-                    raised.append(KeyboardInterrupt())
+            if not raised and self._errors:  # each error comes out of one spin
+                raised.append(self._errors.popleft())
+            if not raised:
+                self.host.raise_interrupt(self.guest)
             return bool(raised) or self._is_stopped or until()
 
         timeout_s = getattr(timeout_sec, 'timeout', timeout_sec)

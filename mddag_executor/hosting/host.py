@@ -565,13 +565,12 @@ class Host:
                 ends |= number in guest.signals
         return ends
 
-    def take_interrupt(self, guest: Guest | None) -> bool:
-        """Return whether the calling thread is that of a main which a SIGINT has interrupted."""
-        if guest is None or not guest.interrupted or (
-                guest.thread is not threading.current_thread()):
-            return False
-        guest.interrupted = False
-        return True
+    def raise_interrupt(self, guest: Guest | None) -> None:
+        """Raise KeyboardInterrupt if a SIGINT has interrupted the main of the calling thread."""
+        if guest is not None and guest.interrupted and (
+                guest.thread is threading.current_thread()):
+            guest.interrupted = False
+            raise KeyboardInterrupt
 
     def note_interrupt(self) -> None:
         """Note a KeyboardInterrupt in the main thread."""
@@ -666,8 +665,7 @@ class Host:
 
     def _ok(self) -> bool:
         guest = self.current_guest()
-        if self.take_interrupt(guest):  # it came between two spins; alone it would be raised there
-            raise KeyboardInterrupt
+        self.raise_interrupt(guest)  # it came between two spins; alone it would be raised there
         if self._is_ending() and (guest is not None or self._is_of_callback()):
             return False  # but for the executor's own threads it is until the very end
         return Context.ok(self.context) and not (guest is not None and guest.ended)

@@ -1,6 +1,6 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
-"""rclpy, initialised for the duration of a command."""
+"""rclpy for the duration of a command: initialised, and what this package logs with it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from mddag_executor.errors import UsageError
 from mddag_executor.hosting.loading import ros_arguments
 import rclpy
 from rclpy.context import Context
+from rclpy.impl.logging_severity import LoggingSeverity
+from rclpy.logging import get_logger
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import get_default_context, try_shutdown
 
@@ -47,6 +49,23 @@ def initialised(
         yield context or get_default_context()
     finally:
         try_shutdown(context=context)
+
+
+@contextmanager
+def quiet_log(errors_only: bool) -> Iterator[None]:
+    """
+    Let this package log errors only, if that is wanted; the logs of nodes stay as they are.
+
+    A level that the user gives this package with ``--ros-args --log-level`` is stronger.
+    """
+    logger = get_logger('mddag_executor')
+    if errors_only:
+        logger.set_level(LoggingSeverity.ERROR)
+    try:
+        yield
+    finally:
+        if errors_only:
+            logger.set_level(LoggingSeverity.UNSET)
 
 
 def _init(context: Context | None, arguments: list[str]) -> None:

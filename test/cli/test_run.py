@@ -103,6 +103,27 @@ def robot(seconds):
     Path('robot.py').write_text(f'import time\n{text}')
 
 
+LATE = """
+mddag: 1
+nodes:
+  - node: /one
+    callbacks: [{name: run, timer: 50ms, deadline: 1ms, execution_time: 10ms}]
+  - node: /other
+    callbacks: [{name: run, timer: 50ms, deadline: 1ms, execution_time: 10ms}]
+"""
+
+
+@pytest.mark.parametrize('processes', [1, 2])
+def test_quiet_runs_log_no_misses_unless_they_are_asked_for(folder, mddag, processes):
+    Path('late.yaml').write_text(LATE)
+    words = ['run', 'late.yaml', '--synthetic', 'sleep', '--duration', '1s', '-q',
+             '--processes', processes]
+    assert mddag(*words) == (0, '', '')
+    done = mddag(*words, '--ros-args', '--log-level', 'mddag_executor:=warn')
+    assert (done.returncode, done.stdout) == (0, '')
+    assert re.search(r'\[WARN\] .* deadlines? missed', done.stderr)
+
+
 def test_three_commands_from_a_robot_to_a_verdict(folder, mddag):
     """Recorded without a declaration, which then comes from the recording (see docs/start.md)."""
     robot(0.05)

@@ -107,6 +107,14 @@ _ROSBRIDGE = ('rosbridge_suite/rosbridge_library/src', 'rosbridge_suite/rosbridg
               'rosbridge_suite/rosapi/src')
 _FLEXBE = tuple(f'flexbe_behavior_engine/flexbe_{each}' for each in (
     'core', 'mirror', 'onboard', 'widget', 'input'))
+# as in its config/sim.yaml
+_F1TENTH = (
+    'ego_namespace:=ego_racecar', 'ego_odom_topic:=odom', 'ego_opp_odom_topic:=opp_odom',
+    'ego_scan_topic:=scan', 'ego_drive_topic:=drive', 'opp_namespace:=opp_racecar',
+    'opp_odom_topic:=odom', 'opp_ego_odom_topic:=opp_odom', 'opp_scan_topic:=opp_scan',
+    'opp_drive_topic:=opp_drive', 'scan_distance_to_base_link:=0.275', 'scan_fov:=4.7',
+    'scan_beams:=1080', 'map_path:=maps/levine', 'map_img_ext:=.png', 'num_agent:=1', 'sx:=0.0',
+    'sy:=0.0', 'stheta:=0.0', 'sx1:=2.0', 'sy1:=0.5', 'stheta1:=0.0', 'kb_teleop:=true')
 _SUM = (('/add_two_ints', 'example_interfaces/srv/AddTwoInts', {'a': 2, 'b': 3}),)
 _IS_SUM = (('/add_two_ints', 'example_interfaces/srv/AddTwoInts', {'sum': 42}),)
 _FIBONACCI = (('/fibonacci', 'example_interfaces/action/Fibonacci', {'order': 3}),)
@@ -185,7 +193,8 @@ PROGRAMS = (
             (*_ROSBRIDGE, 'rosbridge_suite/rosbridge_server/scripts'),
             parameters=('address:=127.0.0.1',)),
     Program('tree_watcher', 'py_trees_ros.programs.tree_watcher:main', ('py_trees_ros',)),
-    Program('gym_bridge', 'f1tenth_gym_ros.gym_bridge:main', ('f1tenth_gym_ros',)),
+    Program('gym_bridge', 'f1tenth_gym_ros.gym_bridge:main', ('f1tenth_gym_ros',), (
+        ('/cmd_vel', Twist(linear=Vector3(x=0.2))),), parameters=_F1TENTH),
     Program('crazyflie_sim', 'crazyflie_sim.crazyflie_server:main', (
         'crazyswarm2/crazyflie_sim', 'crazyswarm2/crazyflie_py')),
     Program('vel_mux', 'crazyflie_examples.vel_mux:main', (

@@ -10,6 +10,7 @@ import threading
 import weakref
 
 from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor.session import Session
 import pytest
 import rclpy
 from rclpy.context import Context
@@ -91,6 +92,26 @@ def test_a_dropped_executor_is_freed_after_a_callback_that_still_runs(ros_contex
     del executor
     assert wait_for(lambda: threading.active_count() <= before + 2), threading.enumerate()
     go_on.set()
+    assert wait_for(lambda: threading.active_count() == before)
+
+
+def test_threads_end_while_a_callback_that_is_abandoned_still_runs(make_executor, make_node):
+    """The descriptors are closed only when no thread waits for one of them any more."""
+    for _ in range(5):
+        abandon_a_callback(make_executor(num_workers=64, nodes=[make_node()]))
+
+
+def abandon_a_callback(executor):
+    """End a run while one of its callbacks waits, and check that all other threads end."""
+    before, begun, let_go = threading.active_count(), threading.Event(), threading.Event()
+    executor.create_task(lambda: (begun.set(), let_go.wait()))
+    session = Session(executor)
+    with session:
+        assert begun.wait(15)
+        session.hurry()
+    assert not session.clean
+    assert wait_for(lambda: threading.active_count() == before + 1)
+    let_go.set()
     assert wait_for(lambda: threading.active_count() == before)
 
 

@@ -3,6 +3,7 @@
 """Spinning: what comes out of it, one callback at a time, and what ends it."""
 
 import contextlib
+from functools import partial
 import itertools
 import math
 import signal
@@ -477,6 +478,32 @@ def signal_inside():
     with InterruptsDeferred():
         signal.raise_signal(signal.SIGINT)
         interruptible_sleep(0)
+
+
+def test_a_deferred_signal_is_handled_once(request, monkeypatch):
+    """Also if one of its repetitions is on its way to the main thread just then."""
+    handled = []
+    before = signal.signal(signal.SIGALRM, lambda *_: handled.append(1))
+    request.addfinalizer(lambda: signal.signal(signal.SIGALRM, before))
+    monkeypatch.setattr('mddag_executor.executor.interrupts.REPEAT_S', 0)
+    request.addfinalizer(partial(sys.setswitchinterval, sys.getswitchinterval()))
+    sys.setswitchinterval(1e-6)
+    of_package = types.FunctionType(
+        alarm_inside.__code__, {**globals(), '__name__': 'mddag_executor'})
+    for n in range(2000):
+        of_package(n % 500, waits=n % 2)
+        time.sleep(0)
+        assert len(handled) == n + 1
+
+
+def alarm_inside(n, waits):
+    """Send a signal while all are deferred, do something, and wait or leave that to the end."""
+    with InterruptsDeferred():
+        signal.raise_signal(signal.SIGALRM)
+        for _ in range(n):
+            pass
+        if waits:
+            interruptible_sleep(0)
 
 
 @pytest.mark.parametrize('kind', ['sleep', 'call', 'coroutine', 'publish'])

@@ -254,6 +254,9 @@ before = globals().setdefault('BEFORE', {})
         'executor/interrupts.py', 'number == signal.SIGINT or _is_in_callback(frame)',
         'False')], of(
         'test_spin.py', 'test_a_second_interrupt_comes_at_once')),
+    Case('repetitions_of_a_signal_are_handled_as_well', [(
+        'executor/interrupts.py', 'if number in self._awaited:', 'if False:')], of(
+        'test_spin.py', 'test_a_deferred_signal_is_handled_once')),
     Case('callbacks_are_not_interruptible', [(
         'executor/interrupts.py', 'if frame is not None and frame.f_code in _runs_callbacks:',
         'if False:')], of(
