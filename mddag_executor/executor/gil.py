@@ -9,12 +9,14 @@ Python's global interpreter lock (GIL) lets one thread compute at a time.  The c
 starts a callback that holds the GIL only if no callback as urgent holds it (rule 10 of
 ``core.rules``).
 
-1.  *Measured.*  Of each execution, three times are measured: its duration (wall), the CPU time of
+1.  *Measured.*  Of an execution, three times are measured: its duration (wall), the CPU time of
     its thread (own), and the CPU time of all other threads of the process (others).  If own is
     over four fifths of wall, the callback holds the GIL.  If own is less than half of the time in
     which no other thread computed, the callback waits for something else and does not hold the
     GIL, unless it was preempted on its CPU and may have waited for that.  Anything between is
-    inconclusive.
+    inconclusive.  Each execution is measured until the habit is known.  After that one in
+    ``SELDOM`` short executions is, one in ``LATELY`` of a callback that waits for long, and each
+    one of a callback that computes for long or has just behaved differently.
 2.  *Unknown.*  After inconclusive first executions, the next ones are treated as if they held the
     GIL: then no other callback computes, and the measurement is conclusive.  Later, one execution
     is treated so (a trial) after every ``LATELY`` inconclusive ones.
@@ -111,7 +113,7 @@ class GilHabit:
     """
 
     __slots__ = ('holds', 'computes', 'mean_ns', 'needs_ns', 'is_known', 'is_declared', 'rests',
-                 'share', '_least', '_first', '_unclear', '_runs', '_is_trial')
+                 'share', '_least', '_first', '_unclear', '_runs', '_is_trial', '_has_waited')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.is_declared = self.is_known = declared is not None
@@ -124,6 +126,8 @@ class GilHabit:
         self._unclear = 0
         self._runs = 0
         self._is_trial = False
+        # whether it is known to wait, and has when it was last measured
+        self._has_waited = False
 
     def took(self, own: int, undisturbed: int) -> None:
         """
@@ -157,9 +161,24 @@ class GilHabit:
         """
         if not self.is_declared:
             self._learn(wall, own, others, starved)
+        self._has_waited = not self.computes and own < WAITS * (wall - others)
         self.rests = 0
         if self.is_known and not self._is_trial and self.needs_ns >= 0:
             self.rests = (SELDOM if self._runs == LATELY else LATELY) - 1
+
+    def rest_less(self) -> None:
+        """Let most of its next executions be measured, as the last one was long."""
+        self.rests = min(self.rests, LATELY - 1) if self._has_waited else 0
+
+    def waited(self, undisturbed: int) -> None:
+        """
+        Update the usual times after a long execution of which only the duration was measured.
+
+        :param undisturbed: see ``took``.
+        """
+        if self._has_waited:
+            self._least = min(undisturbed, self._least + self._least // SELDOM + 1)
+            self.needs_ns = max(self.mean_ns, self._least)
 
     def _learn(self, wall: int, own: int, others: int, starved: bool) -> None:
         usual = 0 if self._is_trial else self.holds
@@ -192,14 +211,17 @@ class Measurement:
     The CPU times during an execution; they update the ``habit`` at the end, unless it rests.
 
     The time between ``pause`` and ``resume``, while it waits without a worker, does not count.
+
+    :ivar is_complete: whether it updates the habit.
     """
 
-    __slots__ = ('_habit', '_process', '_preempted', '_own', '_start', '_sums')
+    __slots__ = ('_habit', '_process', '_preempted', '_own', '_start', '_sums', 'is_complete')
 
     def __init__(self, habit: GilHabit) -> None:
         self._habit = habit
         # other threads may change the habit meanwhile, so it is asked once
-        self._sums: list[int] | None = [0, 0, 0] if habit.rests < 1 else None
+        self.is_complete = habit.rests < 1
+        self._sums: list[int] | None = [0, 0, 0] if self.is_complete else None
         self._own = 0
         self._process = self._preempted = self._start = 0
         self.resume()
@@ -238,12 +260,10 @@ class Schedule(NamedTuple):
 
     :ivar delay_ns: how long it was ready to run without a CPU; 0 if unknown.
     :ivar slices: how often it got a CPU; -1 if unknown.
-    :ivar is_asleep: whether it neither runs nor is ready to run.
     """
 
     delay_ns: int
     slices: int
-    is_asleep: bool
 
 
 _libc = ctypes.PyDLL(None)  # none of the calls below blocks, so the GIL is kept
@@ -263,12 +283,16 @@ def _read(path: str) -> bytes:
 
 def schedule_of(tid: int) -> Schedule:
     """Return the scheduling data of a thread of this process, by its native id."""
-    folder = f'/proc/self/task/{tid}'
-    figures = _read(f'{folder}/schedstat').split()
-    state = _read(f'{folder}/stat').rpartition(b') ')[2][:1]
-    if len(figures) != 3 or not state:
-        return Schedule(0, -1, True)
-    return Schedule(int(figures[1]), int(figures[2]), state in b'SD')
+    figures = _read(f'/proc/self/task/{tid}/schedstat').split()
+    if len(figures) != 3:
+        return Schedule(0, -1)
+    return Schedule(int(figures[1]), int(figures[2]))
+
+
+def is_asleep(tid: int) -> bool:
+    """Return whether a thread of this process neither runs nor is ready to run."""
+    # the kernel needs longer to write this file than the one of ``schedule_of``
+    return _read(f'/proc/self/task/{tid}/stat').rpartition(b') ')[2][:1] in b'SD'
 
 
 def cpu_ns(ident: int) -> int:
@@ -361,7 +385,7 @@ class GilCheck:
         if 20 * own >= passed:  # it computes for at least 5 % of the time
             self._unclear = 0
             return False
-        if new.schedule.is_asleep:
+        if is_asleep(tid):
             if passed >= CHECK_NS and new.schedule.slices == last.schedule.slices >= 0:
                 return True
             others = new.others_since(last)

@@ -244,7 +244,9 @@ class WorkerThread:
         else:
             work.cpu_ns += measurement.end()
         if wall > SHORT_CALLBACK_NS:
-            habit.rests = 0  # long callbacks are measured each time
+            if (measurement is None or not measurement.is_complete) and not self.has_lent:
+                habit.waited(wall)
+            habit.rest_less()
         entity.wall_ns += (wall - entity.wall_ns) >> 3 if entity.ran else wall - entity.wall_ns
         self.pool.note_eager(entity)
         if self.published:

@@ -22,8 +22,8 @@ from mddag_executor.executor.gil import (
     cpu_ns,
     GilCheck,
     GilHabit,
+    is_asleep,
     Schedule,
-    schedule_of,
 )
 from mddag_executor.executor.work import Work
 from msg_graph import loads
@@ -379,6 +379,33 @@ def test_the_first_executions_of_a_callback_do_not_count():
     assert found == [-1, -1, -1, 5 * MS, 6 * MS]
 
 
+def test_one_in_eight_long_executions_is_measured_of_a_callback_that_waits():
+    """Each one again as soon as it computes, and of a callback that does."""
+    habit = GilHabit()
+
+    def run(own, wall):
+        is_measured = habit.rests < 1
+        if is_measured:
+            habit.took(own * MS, wall * MS)
+            habit.learn(wall * MS, own * MS, 0)
+        else:
+            habit.rests -= 1
+            habit.waited(wall * MS)
+        habit.rest_less()
+        return is_measured
+
+    for _ in range(20):
+        run(1, 10)
+    assert sum(run(1, 10) for _ in range(80)) == 10 and habit.needs_ns == 10 * MS
+    assert habit.holds == 0
+    run(1, 6)
+    assert habit.needs_ns == 6 * MS   # measured or not, the least duration is known
+    while not run(9, 10):
+        pass
+    assert all(run(9, 10) for _ in range(80)) and habit.computes == 1
+    assert habit.needs_ns == habit.mean_ns
+
+
 def test_a_message_of_a_job_comes_to_a_queue_that_is_full_of_short_ones_without_a_job():
     one = OneUser(depth=2)
     works = [one.hear(origin, 0) for origin in (None, None, one.publish(0))]
@@ -579,7 +606,7 @@ def test_the_threads_that_check_do_not_count_as_computing():
     sleeper = threading.Thread(target=ended.acquire, daemon=True)
     sleeper.start()
     tid, me = sleeper.native_id, threading.get_ident()
-    while not schedule_of(tid).is_asleep:
+    while not is_asleep(tid):
         sleep(0.001)
     found = []
     for before, after in ((0, 0), (0, 1)):  # the second time, the thread has run a callback
@@ -601,8 +628,9 @@ def test_on_a_busy_machine_a_thread_that_waits_for_the_gil_does_not_count_as_wai
     monkeypatch, delay, waits
 ):
     """The thread that has the GIL waits for a CPU, so no thread computes."""
-    schedules = iter((Schedule(0, 10, True), Schedule(delay * MS, 12, True)))
+    schedules = iter((Schedule(0, 10), Schedule(delay * MS, 12)))
     monkeypatch.setattr(gil, 'schedule_of', lambda tid: next(schedules))
+    monkeypatch.setattr(gil, 'is_asleep', lambda tid: True)
     monkeypatch.setattr(gil, 'cpu_ns', lambda ident: 0)
     monkeypatch.setattr(gil, 'process_time_ns', lambda: 0)
     check = GilCheck()
