@@ -56,6 +56,7 @@ from mddag_executor.executor.attribution import (
 from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.hearing import Allowance, is_plausible
 from mddag_executor.executor.other_processes import contested
+from mddag_executor.executor.publishing import publish_as_executor
 from mddag_executor.executor.quiet_nodes import quiet_node
 from mddag_executor.executor.work import Work
 from msg_graph import TaskSet
@@ -167,7 +168,7 @@ class Announcements:
                 self._token, 0, SILENT, 0, 0, home, number, release, origin.dag, origin.vertex,
                 self._number[topic])
             self._pool.unlocked_calls.append(
-                partial(publisher.publish, UInt8MultiArray(data=entry)))
+                partial(publish_as_executor, publisher, UInt8MultiArray(data=entry)))
 
     def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
         """Return name and release of a job; None: no job, or it has ended meanwhile."""

@@ -181,6 +181,15 @@ def _send(
             raise
 
 
+def publish_as_executor(publisher: Publisher, msg: Any) -> None:
+    """Publish a message of the executor itself, which belongs to no callback of the thread."""
+    before, current.running = current.running, None
+    try:
+        publisher.publish(msg)
+    finally:
+        current.running = before
+
+
 def install() -> None:
     """Wrap rclpy's methods; further calls change nothing."""
     global _installed

@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.executor.attribution import Announced, Origin
 from mddag_executor.executor.hearing import Allowance, is_plausible
+from mddag_executor.executor.publishing import publish_as_executor
 from mddag_executor.executor.quiet_nodes import quiet_node
 from msg_graph import TaskSet
 from msg_graph.model import optional_edges
@@ -100,7 +101,7 @@ class Silences:
         if stamp is not None and publisher is not None:
             entry = _ENTRY.pack(stamp, origin.dag, origin.vertex, self._number[topic])
             self._pool.unlocked_calls.append(
-                partial(publisher.publish, UInt8MultiArray(data=entry)))
+                partial(publish_as_executor, publisher, UInt8MultiArray(data=entry)))
 
     def _hear(self, message: UInt8MultiArray) -> None:
         """Handle a silence of another executor, or of this one, which changes nothing."""
