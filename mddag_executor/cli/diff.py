@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "judged by the one that it was recorded with, or else by that of the other run)")
     add('--callbacks', action='store_true', help='also show a table of all callbacks')
     add('--fail-on-worse', action='store_true',
-        help='exit with status 1 if a sink missed a larger share of its deadlines in B, or its '
-        'p99 response time grew by more than is allowed')
+        help='exit with status 1 if a sink missed a larger share of its deadlines in B, was not '
+        'due in B, or its p99 response time grew by more than is allowed')
     add('--allow-growth', type=_share, metavar='SHARE',
         help='with --fail-on-worse and in the tables: how much the p99 response time of a sink '
         'may grow, for instance 10%% (default: by any amount)')
@@ -57,8 +57,10 @@ def main(args: argparse.Namespace) -> int:
     first, second = (
         Source(*common.input_path(common.one_run([path], ())), task_set)
         for path in (args.first, args.second))
-    before, after = _results(args, first, second)
-    difference = diff.compare(before, after, args.allow_growth)
+    before, after, declared = _results(args, first, second)
+    difference = diff.compare(
+        before, after, args.allow_growth,
+        {dag.name for dag in declared.dags if dag.sporadic or dag.once})
     common.show(args, difference, diff.lines(difference, args.callbacks))
     if not args.fail_on_worse:
         return 0
@@ -71,18 +73,19 @@ def main(args: argparse.Namespace) -> int:
 
 def _results(
     args: argparse.Namespace, first: Source, second: Source
-) -> tuple[ReplayResult, ReplayResult]:
+) -> tuple[ReplayResult, ReplayResult, TaskSet]:
+    """Return both results, and the declaration that judges the second run."""
     if _has_declaration(first):
         before, declared = _result(first, args.begin or 0)
         if not _has_declaration(second):
             second = second._replace(task_set=declared)
-        return before, _result(second, args.begin or 0)[0]
+        return before, *_result(second, args.begin or 0)
     # without one of its own it is judged by the other's, and that must have one
     if not _has_declaration(second):
         first.check_deadlines()
         second.check_deadlines()
     after, declared = _result(second, args.begin or 0)
-    return _result(first._replace(task_set=declared), args.begin or 0)[0], after
+    return _result(first._replace(task_set=declared), args.begin or 0)[0], after, declared
 
 
 def _has_declaration(source: Source) -> bool:

@@ -9,7 +9,12 @@ import threading
 from typing import Any
 
 from mddag_executor.hosting.loading import Program
+from rclpy.exceptions import ROSInterruptException
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+
+CONTEXT_HAS_ENDED = (ExternalShutdownException, ROSInterruptException)
+"""What spins and ``Rate.sleep`` raise in a program whose context another one has shut down."""
 
 
 @dataclass(eq=False)

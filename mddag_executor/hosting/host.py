@@ -65,7 +65,7 @@ from mddag_executor.executor.interrupts import handler_of
 from mddag_executor.executor.registry import snapshot
 from mddag_executor.executor.work import current
 from mddag_executor.hosting.change import Change
-from mddag_executor.hosting.guest import Guest
+from mddag_executor.hosting.guest import CONTEXT_HAS_ENDED, Guest
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
 from mddag_executor.hosting.signals import Signals
@@ -99,10 +99,13 @@ class Host:
     :param concurrent: the names of the nodes whose callbacks may overlap with each other, and with
         what their program does between its spins, whatever executor they have.
     :ivar executor: runs the nodes of all programs; None before ``start``.
+    :ivar time_is_over: whether the run ends because its time is over: a program that rclpy
+        interrupts then has not failed.
     """
 
     def __init__(self, signals: Signals | None = None, concurrent: Iterable[str] = ()) -> None:
         self.executor: Any = None
+        self.time_is_over = False
         self.concurrent = {*concurrent}
         self.guests: list[Guest] = []
         self.global_executor: Any = None  # of callbacks: they belong to no program's thread
@@ -348,8 +351,10 @@ class Host:
                 guest.error = error
         except BaseException as error:
             # the end of the run may cut its start off; what it raises of its own is an error
-            if guest.is_complete or not self._ended or not (
-                    type(error).__module__.startswith('rclpy.')):
+            is_cut_off = self._ended and not guest.is_complete and (
+                type(error).__module__.startswith('rclpy.'))
+            if not is_cut_off and not (
+                    self.time_is_over and isinstance(error, CONTEXT_HAS_ENDED)):
                 guest.error = error
         guest.finished = True
         if guest.error is not None or not guest.returned:

@@ -206,7 +206,7 @@ class _Run:
                     self._has_started = False
                 executor.set_judging(True, self._begin_of_several())
                 self._watch.restart()
-                session.wait(self._options.seconds)
+                host.time_is_over = not session.wait(self._options.seconds)
         except MddagError as error:
             # The exception of a callback says more than that its program failed to start.
             if session.error is None:

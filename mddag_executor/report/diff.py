@@ -5,12 +5,13 @@ Compares two runs, sink by sink and callback by callback.
 
 Sinks and callbacks are matched by name. If only one run has them, the other side is empty. A sink
 is *worse* in the second run if it missed a larger share of its deadlines, if none of its jobs was
-due in contrast to the first run or, with a tolerance, if its p99 response time grew by more.
+due in contrast to the first run or, with a tolerance, if its p99 response time grew by more.  A
+sink of a DAG that is released only when needed (``sporadic``, ``once``) may be not due.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.core.requirements import as_dags
@@ -46,20 +47,22 @@ _HEADER = (
 
 
 def compare(
-    before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None
+    before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None,
+    when_needed: Collection[str] = (),
 ) -> DiffResult:
     """
     Compare the results of two replays.
 
     :param tolerance: allowed growth of a p99 response time, as a share (0.1 is 10 %).
     :param before: results of ``Replay`` or ``Reschedule``, as is ``after``.
+    :param when_needed: names of the DAGs that are released only when needed.
     :returns: for JSON: ``sinks`` by DAG and name with both sides (``a``, ``b``; null if missing),
         ``change_ns`` and ``change`` (share) of response times and ``worse``; ``requirements`` of
         paths in the same format; ``callbacks`` with
         both sides' executions and mean times; ``worse`` of the whole; ``compared``, the number of
         sinks due in both.
     """
-    dags = compare_sinks(before['dags'], after['dags'], tolerance)
+    dags = compare_sinks(before['dags'], after['dags'], tolerance, when_needed)
     requirements = compare_requirements(before, after, tolerance)
     every = [sink for each in (dags, requirements) for dag in each.values()
              for sink in dag['sinks'].values()]
@@ -77,14 +80,16 @@ def compare(
 
 
 def compare_sinks(
-    before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None
+    before: Mapping[str, Any], after: Mapping[str, Any], tolerance: float | None = None,
+    when_needed: Collection[str] = (),
 ) -> dict[str, ComparedDag]:
-    """Compare the ``dags`` of two results; return those of the difference."""
+    """Compare the ``dags`` of two results (see ``compare``); return those of the difference."""
     dags: dict[str, ComparedDag] = {}
     for name in _union(before, after):
         sides = [side.get(name, {'sinks': {}})['sinks'] for side in (before, after)]
         dags[name] = {'sinks': {
-            sink: _sink(sides[0].get(sink), sides[1].get(sink), tolerance)
+            sink: _sink(sides[0].get(sink), sides[1].get(sink), tolerance,
+                        must_be_due=name not in when_needed)
             for sink in _union(*sides)}}
     return dags
 
@@ -117,7 +122,8 @@ def _side(sink: Mapping[str, Any] | None) -> SinkSide | None:
 
 
 def _sink(
-    before: Mapping[str, Any] | None, after: Mapping[str, Any] | None, tolerance: float | None
+    before: Mapping[str, Any] | None, after: Mapping[str, Any] | None, tolerance: float | None,
+    must_be_due: bool,
 ) -> ComparedSink:
     a, b = _side(before), _side(after)
     change_ns: ResponseTimes | None = None
@@ -125,7 +131,8 @@ def _sink(
     worse = False
     if a is not None and b is not None:
         worse = (b['due'] - b['in_time']) * a['due'] > (a['due'] - a['in_time']) * b['due'] \
-            or (a['due'] == 0 and b['in_time'] < b['due']) or (b['due'] == 0 and a['due'] > 0)
+            or (a['due'] == 0 and b['in_time'] < b['due']) or (
+                must_be_due and b['due'] == 0 and a['due'] > 0)
         if a['response_ns'] is not None and b['response_ns'] is not None:
             old, new = a['response_ns'], b['response_ns']
             change_ns = {'min': new['min'] - old['min'], 'median': new['median'] - old['median'],

@@ -33,6 +33,7 @@ from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.timers import TimerEntity
 from mddag_executor.executor.waitables import WaitableEntity
 from mddag_executor.executor.work import Work
+from mddag_executor.hosting.guest import CONTEXT_HAS_ENDED
 from mddag_executor.hosting.initialised import initialised
 from mddag_executor.hosting.loading import describe, Program, ros_arguments
 from mddag_executor.replacements import Replacements
@@ -51,15 +52,13 @@ from mddag_executor.rerun.timers import Timers
 from mddag_executor.results.comparisons import RerunResult, RerunResultRare, RerunVerdicts
 from mddag_executor.text import counted
 from msg_graph import TaskSet
-from rclpy.exceptions import ROSInterruptException
-from rclpy.executors import ExternalShutdownException
 from rclpy.guard_condition import GuardCondition
 from rclpy.node import Node
 from rclpy.utilities import get_default_context
 
 PATIENCE_S = 30.0
 _OF_ALL_NODES = {'/parameter_events'}
-_ENDS = (ExternalShutdownException, KeyboardInterrupt, ROSInterruptException)
+_ENDS = (*CONTEXT_HAS_ENDED, KeyboardInterrupt)
 _NO_DISCOVERY = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 
 

@@ -153,3 +153,20 @@ def test_a_run_in_which_nothing_was_due_is_no_better(trace, empty, call):
     assert status == 1 and (
         f'error: {empty} and {empty}: no sink was due in both, so nothing was compared: ' in err)
     assert call('diff', empty, empty).returncode == 0
+
+
+@pytest.mark.parametrize('key, status', [('sporadic: true', 0), ('once: true', 0), ('', 1)])
+def test_a_sink_that_need_not_be_due_is_not_worse_when_it_was_not(tmp_path, call, key, status):
+    """In the second run nothing has released it: nobody has pressed the button."""
+    works = GRAPH.replace('8ms}', '8ms, execution_time: 1ms}')
+    pressed = works + ('  - node: /button\n    callbacks:\n      - {name: press, timer: 20ms, '
+                       f'{key + ", " if key else ""}deadline: 8ms, execution_time: 1ms}}\n')
+    runs = []
+    for name, text in (('both', pressed), ('works', works)):
+        graph, trace = tmp_path / f'{name}.yaml', tmp_path / f'{name}.mcap'
+        graph.write_text(text)
+        assert call('simulate', graph, '--duration', '100ms', '--trace', trace).returncode == 0
+        runs.append(trace)
+    done = call('diff', *runs, tmp_path / 'both.yaml', '--fail-on-worse')
+    assert done.returncode == status
+    assert ('worse, never due in B' if status else '  never due in B') in done.stdout

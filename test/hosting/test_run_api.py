@@ -55,6 +55,30 @@ def wrong():
     raise ValueError('no licence')
 
 
+def sleeps_with_a_rate():
+    rclpy.init()
+    node = Api()
+    threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
+    rate = node.create_rate(50)
+    while rclpy.ok():
+        rate.sleep()
+
+
+def steps_for_ever():
+    rclpy.init()
+    node = Node('steps')
+    node.create_timer(0.02, lambda: None)
+    while True:
+        rclpy.spin_once(node)
+
+
+def fails_at_the_end():
+    try:
+        sleeps_with_a_rate()
+    finally:
+        raise OSError('the device is gone')
+
+
 @pytest.fixture
 def here(tmp_path, monkeypatch, no_thread_leak):
     monkeypatch.chdir(tmp_path)
@@ -108,6 +132,15 @@ def test_what_a_node_raises_has_the_result_with_it(here):
     with pytest.raises(MddagError, match=f'--node {__name__}:wrong: it failed while starting'):
         run(RunOptions(nodes=[wrong]))
     assert run(RunOptions(nodes=[Api], duration='100ms')).status == 0  # nothing is left of it
+
+
+def test_a_program_that_the_end_of_the_time_interrupts_has_not_failed(here):
+    """By itself, it would not end; what it raises of its own is an error."""
+    result = run(RunOptions(nodes=[sleeps_with_a_rate, steps_for_ever], duration='500ms'))
+    assert (result.status, result.error) == (0, None)
+    assert [(each.status, each.message) for each in result.programs] == [(0, '')] * 2
+    with pytest.raises(MddagError, match='fails_at_the_end: it raised OSError: the device is go'):
+        run(RunOptions(nodes=[fails_at_the_end], duration='500ms'))
 
 
 @pytest.mark.parametrize(('given', 'line'), [
