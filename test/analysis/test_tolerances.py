@@ -157,7 +157,7 @@ def test_a_run_in_which_nothing_was_due_is_no_better(trace, empty, call):
 
 @pytest.mark.parametrize('key, status', [('sporadic: true', 0), ('once: true', 0), ('', 1)])
 def test_a_sink_that_need_not_be_due_is_not_worse_when_it_was_not(tmp_path, call, key, status):
-    """In the second run nothing has released it: nobody has pressed the button."""
+    """In the second run nothing has released it: the button was not pressed."""
     works = GRAPH.replace('8ms}', '8ms, execution_time: 1ms}')
     pressed = works + ('  - node: /button\n    callbacks:\n      - {name: press, timer: 20ms, '
                        f'{key + ", " if key else ""}deadline: 8ms, execution_time: 1ms}}\n')
