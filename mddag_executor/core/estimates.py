@@ -4,10 +4,11 @@
 Latest starts from measured execution times, for drivers that measure (rule 7).
 
 ``State.start_by`` and ``reach_by`` begin with the declared execution times.  When the measured
-time of a vertex has changed by more than an eighth, those of its DAG are computed again.  So most
-executions cost one comparison.  Measured is the time that the callback needs when nothing disturbs
-it: the mean CPU time or, if it waits, the least recent duration (``executor.gil``).  After
-``FORGET_PERIODS`` without a new measurement, the declared time counts again.
+time of a vertex has changed by more than an eighth, its latest starts are computed again, and
+those of the vertices before it.  So most executions cost one comparison.  Measured is the time
+that the callback needs when nothing disturbs it: the mean CPU time or, if it waits, the least
+recent duration (``executor.gil``).  After ``FORGET_PERIODS`` without a new measurement, the
+declared time counts again.
 """
 
 from __future__ import annotations
@@ -21,59 +22,105 @@ CHANGE = 8
 LEAST_CHANGE_NS = 100_000
 FORGET_PERIODS = 10
 """A measured time is forgotten after this many periods of its DAG without a new one."""
+ADMIT_NS = 50_000_000
+"""
+How often the demand of all callbacks is compared with the capacity, if their times change.
+
+It is a sum over all vertices.  On a busy machine some time changes at each tenth execution.
+"""
+
+Steps = list[tuple[int, list[tuple[int, list[int]]]]]
+"""
+Vertices, each after its successors.
+
+With each are its sinks as indices of ``reach_by``, and with each sink the same of its successors.
+"""
 
 
-def note_time(t: Tables, s: State, vertex: int, mean: int, holds: int, now: int) -> None:
-    """
-    Note the recent execution time of a vertex, ns, and whether it holds the GIL.
+class Estimates:
+    """The latest starts of a run; times are ns."""
 
-    :param mean: -1: not known yet.
-    """
-    known = s.mean[vertex]
-    if mean < 0:
-        mean = known
-    else:
-        s.measured_at[vertex] = now
-        if s.scalars[FORGET_AT] == NEVER:
-            s.scalars[FORGET_AT] = now  # the next measurement finds out
-    if now > s.scalars[FORGET_AT]:
-        _forget(t, s, now)
-    if abs(mean - known) * CHANGE > known + LEAST_CHANGE_NS or holds != s.holder[vertex]:
-        s.mean[vertex] = mean
-        s.holder[vertex] = holds
-        _update(t, s, t.dag_of[vertex])
+    def __init__(self, t: Tables, s: State) -> None:
+        self._t, self._s = t, s
+        # by vertex: what depends on its time; made when that first changes
+        self._steps: dict[int, Steps] = {}
+        # when to compare demand and capacity; NEVER: no time has changed
+        self._admit_at = NEVER
+        self._admitted_at = -NEVER
 
+    def note(self, vertex: int, mean: int, holds: int, now: int) -> None:
+        """
+        Note the recent execution time of a vertex, and whether it holds the GIL.
 
-def _forget(t: Tables, s: State, now: int) -> None:
-    """Forget the times that were measured too long ago."""
-    changed = set()
-    s.scalars[FORGET_AT] = NEVER
-    for vertex in range(t.n_vertices):
-        if s.measured_at[vertex] < 0:
-            continue
-        dag = t.dag_of[vertex]
-        until = s.measured_at[vertex] + FORGET_PERIODS * t.period[dag]
-        if until >= now:
-            s.scalars[FORGET_AT] = min(s.scalars[FORGET_AT], until)
+        :param mean: -1: not known yet.
+        """
+        s = self._s
+        known = s.mean[vertex]
+        if mean < 0:
+            mean = known
         else:
-            s.measured_at[vertex] = -1
-            s.mean[vertex] = t.mean_time[vertex]
-            changed.add(dag)
-    for dag in changed:
-        _update(t, s, dag)
+            s.measured_at[vertex] = now
+            if s.scalars[FORGET_AT] == NEVER:
+                s.scalars[FORGET_AT] = now  # the next measurement finds out
+        if now > s.scalars[FORGET_AT]:
+            self._forget(now)
+        if abs(mean - known) * CHANGE > known + LEAST_CHANGE_NS or holds != s.holder[vertex]:
+            s.mean[vertex] = mean
+            s.holder[vertex] = holds
+            self._update(vertex)
+        if now >= self._admit_at:
+            self._admit_at, self._admitted_at = NEVER, now
+            admit(self._t, s)
+
+    def _forget(self, now: int) -> None:
+        """Forget the times that were measured too long ago."""
+        t, s = self._t, self._s
+        s.scalars[FORGET_AT] = NEVER
+        for vertex in range(t.n_vertices):
+            if s.measured_at[vertex] < 0:
+                continue
+            until = s.measured_at[vertex] + FORGET_PERIODS * t.period[t.dag_of[vertex]]
+            if until >= now:
+                s.scalars[FORGET_AT] = min(s.scalars[FORGET_AT], until)
+            else:
+                s.measured_at[vertex] = -1
+                s.mean[vertex] = t.mean_time[vertex]
+                self._update(vertex)
+
+    def _update(self, vertex: int) -> None:
+        """Compute the latest starts of a vertex, and of those before it, again."""
+        t, s = self._t, self._s
+        means, reach_by, deadlines = s.mean, s.reach_by, t.reach_deadline
+        steps = self._steps.get(vertex)
+        if steps is None:
+            steps = self._steps[vertex] = _steps_to(t, vertex)
+        for each, sinks in steps:
+            for i, after in sinks:
+                start = deadlines[i]
+                for j in after:
+                    if reach_by[j] < start:
+                        start = reach_by[j]
+                reach_by[i] = start - means[each]
+            set_start(t, s, each)
+        self._admit_at = self._admitted_at + ADMIT_NS
 
 
-def _update(t: Tables, s: State, dag: int) -> None:
-    """Compute the latest starts of a DAG again, and which importance gives way."""
-    first, last = t.first_vertex[dag:dag + 2]
-    starts: dict[tuple[int, int], int] = {}
-    for vertex in sorted(range(first, last), key=lambda v: t.height[v]):
-        after = t.successors[t.first_successor[vertex]:t.first_successor[vertex + 1]]
-        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
-            sink = t.reach_sink[i]
-            start = t.reach_deadline[i]
-            for each in after:
-                start = min(start, starts.get((each, sink), start))
-            s.reach_by[i] = starts[vertex, sink] = start - s.mean[vertex]
-        set_start(t, s, vertex)
-    admit(t, s)
+def _steps_to(t: Tables, vertex: int) -> Steps:
+    """Return how to compute the latest starts of a vertex, and of those before it."""
+    first, last = t.first_vertex[t.dag_of[vertex]:t.dag_of[vertex] + 2]
+    found: Steps = []
+    dependent = {vertex}
+    for each in sorted(range(first, last), key=lambda v: t.height[v]):
+        successors = t.successors[t.first_successor[each]:t.first_successor[each + 1]]
+        if each == vertex or not dependent.isdisjoint(successors):
+            dependent.add(each)
+            found.append((each, [
+                (i, [j for after in successors for j in _reaches(t, after)
+                     if t.reach_sink[j] == t.reach_sink[i]])
+                for i in _reaches(t, each)]))
+    return found
+
+
+def _reaches(t: Tables, vertex: int) -> range:
+    """Return the indices of ``reach_by`` of a vertex."""
+    return range(t.first_reach[vertex], t.first_reach[vertex + 1])

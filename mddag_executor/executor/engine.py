@@ -40,7 +40,7 @@ from typing import Any, TYPE_CHECKING
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
 from mddag_executor.core.driven import ANSWERED, GUESSED
-from mddag_executor.core.estimates import note_time
+from mddag_executor.core.estimates import Estimates
 from mddag_executor.core.jobs import is_judged, judge_from
 from mddag_executor.core.overload import admit, is_late
 from mddag_executor.core.queues import has_place
@@ -122,6 +122,7 @@ class Engine:
             max_active_jobs=max_active_jobs, expire_after=expire_after, on_late=on_late)
         self.scheduler = Scheduler(self.tables, n_workers, policy)
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
+        self._note_time = Estimates(self.tables, self.scheduler.state).note
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.attribution = Attribution(task_set)
         #: Judges what is required of paths; None: nothing is.
@@ -703,8 +704,7 @@ class Engine:
             origin = work.origin
             if self._complete(x, end) and origin is not None:
                 habit = entity.habit
-                note_time(
-                    self.tables, self._state, origin.vertex, habit.needs_ns, habit.holds, now)
+                self._note_time(origin.vertex, habit.needs_ns, habit.holds, now)
         else:
             self._finished_watched(work, start, end, now, vtid, worker, failed)
         if self._state.decisions:
@@ -758,7 +758,7 @@ class Engine:
                     work, origin, x, leg, start, end, now, vtid, worker, whole=whole,
                     failed=failed)
             if whole:  # other messages of a sync take less
-                note_time(tables, state, vertex, entity.habit.needs_ns, entity.habit.holds, now)
+                self._note_time(vertex, entity.habit.needs_ns, entity.habit.holds, now)
         elif records is not None:
             records.run(work, start, end, vtid, worker)
         if self.path_watch is not None:

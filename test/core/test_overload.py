@@ -3,15 +3,19 @@
 """What the core does in an overload, and that it does nothing without one (rules 7, 11, 12)."""
 
 from dataclasses import replace
+import random
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from mddag_executor.core.estimates import note_time
+from mddag_executor.core import NEVER, Scheduler, Tables
+from mddag_executor.core.estimates import ADMIT_NS, Estimates
 from mddag_executor.core.jobs import is_miss
+from mddag_executor.core.overload import admit
 from mddag_executor.core.tables import importances
 from mddag_executor.core.tally import counts
+from mddag_executor.resources import find
 from mddag_executor.simulate import Settings, simulate
-from msg_graph import ExecutionTime
+from msg_graph import ExecutionTime, load
 import pytest
 
 from ..conftest import examples
@@ -284,13 +288,42 @@ def test_no_dag_of_several_callbacks_starves(capacity):
 def test_a_measured_time_that_is_not_renewed_is_forgotten():
     """If a callback no longer runs, or runs seldom, its declared time counts again."""
     scheduler = live(with_times(case_of(timer('a', 10, 10, 4), timer('b', 10, 10, 4))).task_set)
-    t, s = scheduler.tables, scheduler.state
+    s = scheduler.state
+    note = Estimates(scheduler.tables, s).note
     slow = 1000 * TICK
     for vertex, now in ((0, 0), (1, 0), (1, 90), (1, 100)):
-        note_time(t, s, vertex, slow, 0, now * TICK)
+        note(vertex, slow, 0, now * TICK)
     assert s.mean[:2] == [slow, slow] and s.reach_by[:2] == [10 * TICK - slow] * 2
-    note_time(t, s, 1, slow, 0, 101 * TICK)
+    note(1, slow, 0, 101 * TICK)
     assert s.mean[:2] == [4 * TICK, slow] and s.reach_by[0] == 6 * TICK
+
+
+def test_measured_times_change_the_latest_starts_of_all_vertices_before():
+    """As computed from the sinks, in a declaration of eleven DAGs; the demand follows soon."""
+    scheduler = Scheduler(Tables.build(load(find('config/autoware.yaml')), legs=True), 7)
+    t, s = scheduler.tables, scheduler.state
+    admit(t, s)
+    estimates, rng = Estimates(t, s), random.Random(1)
+    for now in range(200):
+        estimates.note(rng.randrange(t.n_vertices), rng.randrange(1_000_000), 0, now)
+    for vertex in range(t.n_vertices):
+        for i in range(t.first_reach[vertex], t.first_reach[vertex + 1]):
+            assert s.reach_by[i] == latest_start(t, s.mean, vertex, t.reach_sink[i])
+    assert not s.overloaded[1]
+    for vertex in range(t.n_vertices):
+        estimates.note(vertex, 10 ** 9, 0, 200)
+    assert not s.overloaded[1]
+    estimates.note(0, 10 ** 9, 0, 200 + ADMIT_NS)
+    assert s.overloaded[1]
+
+
+def latest_start(t, means, vertex, sink):
+    """Return by when a vertex must start, after its release, so that a sink is in time; ns."""
+    after = t.successors[t.first_successor[vertex]:t.first_successor[vertex + 1]]
+    starts = [latest_start(t, means, each, sink) for each in after]
+    if vertex == sink:
+        starts.append(t.sink_deadline[sink])
+    return min(starts, default=NEVER) - means[vertex]
 
 
 # --- bursts --------------------------------------------------------------------------------------
