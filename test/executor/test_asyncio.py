@@ -25,7 +25,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import Spinning, wait_for
+from .conftest import patience, Spinning, wait_for
 from .declared import graph
 from .inside import engine_of, pool_of
 
@@ -35,12 +35,12 @@ needs_timeout = pytest.mark.skipif(
 
 def spin(executor, done):
     """Spin on the pool until a future is done."""
-    executor.spin_until_future_complete(done, 15)
+    executor.spin_until_future_complete(done, patience(15))
 
 
 def spin_once(executor, done):
     """Step until a future is done; the coroutines use the executor's own loop."""
-    end = time.monotonic() + 15
+    end = time.monotonic() + patience(15)
     while not done.done() and time.monotonic() < end:
         executor.spin_once(0.1)
 
@@ -48,7 +48,7 @@ def spin_once(executor, done):
 def step_in_loop(executor, done):
     """Step in a program's own loop until a future is done."""
     async def main():
-        end = time.monotonic() + 15
+        end = time.monotonic() + patience(15)
         while not done.done() and time.monotonic() < end:
             executor.spin_once(0)
             await asyncio.sleep(0.001)
@@ -61,7 +61,7 @@ def spin_async(executor, done):
         spinning = asyncio.ensure_future(executor.spin_async())
         over = asyncio.get_running_loop().create_future()
         done.add_done_callback(lambda _: over.set_result(None))
-        await asyncio.wait_for(over, 15)
+        await asyncio.wait_for(over, patience(15))
         spinning.cancel()
         with pytest.raises(asyncio.CancelledError):
             await spinning
@@ -180,7 +180,7 @@ def test_the_coroutine_of_a_callback_is_the_current_task(make_executor, until_do
 
 def test_a_cancelled_callback_ends_without_an_error(make_executor, make_node, until_done):
     """A task of rclpy is cancelled then; a callback that was not cancelled fails."""
-    done, node = Future(), make_node()
+    done, node, ticked = Future(), make_node(), []
 
     async def cancel_itself():
         asyncio.current_task().cancel()
@@ -188,10 +188,11 @@ def test_a_cancelled_callback_ends_without_an_error(make_executor, make_node, un
 
     async def tick():
         timer.cancel()
+        ticked.append(True)
         await cancel_itself()
 
     async def check():
-        while not cancelled.cancelled():
+        while not (cancelled.cancelled() and ticked):
             await asyncio.sleep(0.001)
         done.set_result(None)
 
@@ -208,7 +209,7 @@ def test_a_cancelled_callback_ends_without_an_error(make_executor, make_node, un
     timer.callback = raise_it
     timer.reset()
     with pytest.raises(asyncio.CancelledError):
-        executor.spin_until_future_complete(Future(), 10)
+        executor.spin_until_future_complete(Future(), patience(10))
 
 
 def test_groups_and_jobs_are_kept_while_a_callback_sleeps(make_executor, make_node, tmp_path):

@@ -100,7 +100,7 @@ def test_few_wait_in_python_and_none_is_lost(make_executor, make_node, monkeypat
             count, bound, qos = 60, SERVICE_DEPTH, QoSProfile(depth=100)
             node.create_service(Trigger, '/ask', answer, qos_profile=qos)
             client = node.create_client(Trigger, '/ask', qos_profile=qos)
-            assert client.wait_for_service(15.0)
+            assert client.wait_for_service(60.0)
             futures = [client.call_async(Trigger.Request()) for _ in range(count)]
         else:
             count, bound, futures = 300, MOST, []
@@ -136,7 +136,7 @@ def test_blocked_calls_take_a_bounded_number_of_threads(make_executor, make_node
         callback_group=ReentrantCallbackGroup(), qos_profile=QoSProfile(depth=200))
     client = node.create_client(Trigger, '/ask', qos_profile=QoSProfile(depth=200))
     asking, answering = (make_executor(num_workers=2, nodes=[each]) for each in (node, other))
-    assert client.wait_for_service(15.0)
+    assert client.wait_for_service(60.0)
 
     def ask():
         answers.append(client.call(Trigger.Request(), 20.0))

@@ -27,7 +27,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from .conftest import is_idle, matched, Spinning, wait_for
+from .conftest import is_idle, matched, patience, Spinning, wait_for
 
 DEPTH = 1000
 
@@ -62,9 +62,9 @@ def test_rclpy_s_functions_spin_the_global_executor(
 
     node.create_service(Trigger, '/ask', lambda request, response: response)
     client = node.create_client(Trigger, '/ask')
-    assert client.wait_for_service(5.0)
+    assert client.wait_for_service(60.0)
     answer = client.call_async(Trigger.Request())
-    rclpy.spin_until_future_complete(node, answer, timeout_sec=5.0)
+    rclpy.spin_until_future_complete(node, answer, timeout_sec=patience(5.0))
     assert answer.done() and executor.get_nodes() == []
 
     together, met = threading.Barrier(3), []
@@ -216,7 +216,7 @@ def test_a_forked_copy_ends_with_the_callback_that_forked_it(make_executor, make
     ticks = counting(node)
     executor = make_executor(num_workers=2, nodes=[node])
     task = executor.create_task(forks, 'return')
-    executor.spin_until_future_complete(task, timeout_sec=15.0)  # in this thread
+    executor.spin_until_future_complete(task, timeout_sec=patience(15.0))  # in this thread
     assert statuses.pop('return') == 1
     with Spinning(executor):
         for name in ends:
@@ -270,7 +270,7 @@ def test_a_lifecycle_node_and_its_parameters(make_executor, make_node, ros_conte
         return task.result()
 
     with Spinning(executor):
-        assert client.wait_for_service(5.0) and parameters.wait_for_services(5.0)
+        assert client.wait_for_service(60.0) and parameters.wait_for_services(60.0)
         result(change, Transition.TRANSITION_CONFIGURE)
         time.sleep(0.05)
         assert heard == []
@@ -343,7 +343,7 @@ def test_entities_that_a_callback_makes_run(make_executor, make_node):
         publisher, client = new.create_publisher(Header, '/made', 10), new.create_client(
             Trigger, '/made')
         matched(publisher)
-        assert client.wait_for_service(15.0) and kept[1].wait_for_server(15.0)
+        assert client.wait_for_service(60.0) and kept[1].wait_for_server(60.0)
         executor.create_task(use(publisher, client, kept[1]))
 
     first = node.create_timer(0.005, make)
@@ -372,7 +372,7 @@ def test_a_cancelled_goal_request_does_not_block_its_callback_group(
     node.create_timer(0.002, lambda: ticks.append(1))
     executor = make_executor(nodes=[node])
     with Spinning(executor):
-        assert client.wait_for_server(15.0)
+        assert client.wait_for_server(60.0)
         client.send_goal_async(Fibonacci.Goal()).cancel()
         cancelled.set()
         assert answered.wait(15.0)

@@ -57,7 +57,8 @@ def test_each_callback_runs_for_the_job_that_its_message_belongs_to(make_executo
     ends = statistics['dags']['chain']['ends']
     missed = ends['expired'] + ends['dropped']
     assert missed >= 4
-    assert ran[-1] + 1 <= count + missed <= ran[-1] + 4  # or after the last that ran
+    # each of the others is missed, and also a job that has expired on a busy machine
+    assert ran[-1] < statistics['dags']['chain']['jobs'] <= count + missed
     assert statistics['undeclared'] == 0
     assert statistics['unattributed'] == {'unknown': 0, 'doubtful': 0}
     assert statistics['dags']['chain']['jobs'] == count + missed
@@ -160,8 +161,10 @@ def test_a_lost_message_expires_its_job(make_executor, make_node):
     found = sinks(executor)['/sink:last']
     dag = executor.statistics()['dags']['chain']
     assert found['completed'] == 0
-    # Three are open, or less behind releases that a busy machine skipped.
-    assert dag['jobs'] - 3 <= dag['ends']['expired'] == found['expired']
+    # Three are open, or less behind releases that a busy machine skipped or dropped.
+    assert dag['jobs'] - 3 <= sum(dag['ends'].values())
+    assert dag['ends']['expired'] == found['expired'] > 3
+    assert not dag['ends']['completed'] and not dag['ends']['late']
 
 
 def test_what_completes_after_the_end_is_not_counted(make_executor, make_node, ros_context):

@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, matched, Spinning, wait_for
+from .conftest import is_idle, matched, patience, Spinning, wait_for
 from .declared import graph
 
 
@@ -238,6 +238,6 @@ def test_each_client_of_a_service_gets_its_own_response(ros_context, make_execut
         for _ in futures:
             server.spin_once(5.0)
         for future in futures:
-            executor.spin_until_future_complete(future, 5.0)
+            executor.spin_until_future_complete(future, patience(5.0))
         assert all(future.done() for future in futures)
     server.shutdown()

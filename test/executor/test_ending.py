@@ -19,7 +19,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import Header
 
-from .conftest import Spinning, wait_for
+from .conftest import patience, Spinning, wait_for
 from .inside import pool_of
 
 LIMIT = resource.RLIMIT_NOFILE
@@ -188,7 +188,7 @@ def test_an_interrupt_of_a_pause_does_not_keep_the_workers_awake(make_executor, 
     monkeypatch.setattr(pool_of(executor)._all_left, 'wait', interrupted)
     with pytest.raises(KeyboardInterrupt):
         executor.spin_until_future_complete(Future(), 0.05)
-    executor.spin_until_future_complete(executor.create_task(lambda: None), 5.0)
+    executor.spin_until_future_complete(executor.create_task(lambda: None), patience(5.0))
 
 
 # --- limits of the system ------------------------------------------------------------------------
@@ -213,7 +213,7 @@ def test_a_thread_that_cannot_be_started_is_started_by_the_next_spin(
     with monkeypatch.context() as limit:
         limit.setattr(threading.Thread, 'start', limited)
         with pytest.raises(RuntimeError, match='new thread'):
-            executor.spin_until_future_complete(Future(), 5.0)
+            executor.spin_until_future_complete(Future(), patience(5.0))
     before = len(ran)
     with Spinning(executor):
         assert wait_for(lambda: len(ran) >= before + 3)

@@ -25,7 +25,7 @@ from rclpy.timer import Rate
 from std_msgs.msg import Header, Int32
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, matched, Pulse, Spinning, wait_for
+from .conftest import is_idle, matched, patience, Pulse, Spinning, wait_for
 from .inside import functions_of_tasks, pool_of
 
 MS = 1_000_000
@@ -96,7 +96,7 @@ def of_services(executor, node, call):
 
     node.create_service(Trigger, '/ask', answer)
     client = node.create_client(Trigger, '/ask')
-    assert client.wait_for_service(5.0)
+    assert client.wait_for_service(60.0)
     for _ in range(MANY):  # one after the other, since of those that wait the queue keeps ten
         assert wait_for(client.call_async(Trigger.Request()).done, 6.0)
 
@@ -262,9 +262,9 @@ def test_a_response_makes_no_task(make_executor, make_node):
     node.create_service(Trigger, '/ask', lambda request, response: response)
     client = node.create_client(Trigger, '/ask')
     executor = make_executor(nodes=[node])
-    assert client.wait_for_service(10.0)
+    assert client.wait_for_service(60.0)
     future = client.call_async(Trigger.Request())
-    executor.spin_until_future_complete(future, 10.0)
+    executor.spin_until_future_complete(future, patience(10.0))
     assert future.done() and not client._pending_requests
     cancelled = client.call_async(Trigger.Request())
     cancelled.cancel()

@@ -5,6 +5,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 import random
+import re
 import threading
 import time
 
@@ -230,7 +231,8 @@ def test_a_stamp_of_another_clock_is_no_release(
     publisher = node.create_publisher(Header, '/old', 10)
     node.create_subscription(Header, '/old', got.append, 10)
     executor = make_executor(loads(text, 'g.yaml'), trace=str(path), nodes=[node])
-    begin = max(100 * 10**9, time.time_ns() + hours * 3600 * 10**9)
+    started = time.time_ns()
+    begin = max(100 * 10**9, started + hours * 3600 * 10**9)
     with Spinning(executor):
         for step in range(10):
             publisher.publish(Header(
@@ -242,8 +244,9 @@ def test_a_stamp_of_another_clock_is_no_release(
     assert (replayed['completed'], replayed['late']) == (10, 0)
     warnings = [line for line in capfd.readouterr().err.splitlines() if 'header stamps' in line]
     assert len(warnings) == 1
-    assert f'/old: the header stamps are {abs(begin - time.time_ns()) / 1e9:.0f}'[:-1] in (
-        warnings[0])
+    said = int(re.search(r'/old: the header stamps are (\d+) s ', warnings[0])[1])
+    first, last = sorted(abs(begin - at) / 1e9 for at in (started, time.time_ns()))
+    assert first - 1 <= said <= last + 1
     assert ('after' if hours > 0 else 'before') in warnings[0]
     assert warnings[0].endswith('at the arrivals')
 
@@ -323,7 +326,7 @@ def test_requests_that_arrive_together_are_recorded_one_by_one(make_executor, ma
 
     node.create_service(Empty, '/serve', serve)
     client = node.create_client(Empty, '/serve')
-    assert client.wait_for_service(5.0)
+    assert client.wait_for_service(60.0)
 
     def call():
         timer.cancel()
@@ -358,4 +361,6 @@ def test_the_cause_of_most_misses(tmp_path):
     with ThreadPoolExecutor() as pool:
         for cause, told in zip(kinds, pool.map(found, kinds)):
             assert told.get(cause, 0) >= 5, cause
-            assert all(n <= told[cause] for other, n in told.items() if other != 'machine'), told
+            # after each stop of a busy machine there are misses of many kinds
+            assert cause == 'machine' or all(
+                n <= told[cause] for other, n in told.items() if other != 'machine'), told

@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
 
-from .conftest import matched, Spinning, wait_for
+from .conftest import matched, patience, Spinning, wait_for
 from .declared import graph
 
 # --- like rclpy's executor -----------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_a_spin_that_waits_for_a_task_raises_its_exception(make_executor, steps)
 
     def spin(future):
         if not steps:
-            executor.spin_until_future_complete(future, 5.0)
+            executor.spin_until_future_complete(future, patience(5.0))
         while steps and not future.done():
             executor.spin_once_until_future_complete(future, 5.0)
 

@@ -114,13 +114,16 @@ def test_a_callback_that_does_not_end_is_named(
                  'future': ', waits for a future'}[how]
     where = f'(at {__name__.rpartition(".")[2]}.py:'
     with session:
-        assert wait_for(lambda: robot.runs == 3)
-        hung = executor.statistics()['unfinished']
-        assert wait_for(lambda: (executor.statistics()['unfinished'] or hung)[0]['for_ns']
-                        > 200 * MS)
+        assert wait_for(lambda: any(
+            each['callback'].startswith('/robot:') and each['for_ns'] > 200 * MS
+            for each in executor.statistics()['unfinished']))
         assert wait_for(partial(is_noted, path, killed, waits_for))
-        level, message = executor._diagnostics._pool.status(0)[1:3]
-        assert (level, where in message, message.count('has run for')) == (1, True, 1)
+
+        def is_reported():
+            level, message = executor._diagnostics._pool.status(0)[1:3]
+            # on a busy machine another callback may run for long as well
+            return (level, where in message, message.count('has run for')) == (1, True, 1)
+        assert wait_for(is_reported)
         session.hurry()
     assert session.clean == (how == 'future')
     statistics = executor.statistics()

@@ -20,7 +20,7 @@ from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
 
-from .conftest import is_idle, Pulse, Spinning, wait_for
+from .conftest import is_idle, patience, Pulse, Spinning, wait_for
 
 SUCCEEDED, CANCELED = 4, 5
 QOS = QoSProfile(depth=100)
@@ -94,7 +94,7 @@ def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise
     executor = make_executor(nodes=[node])
     for _ in range(2):
         task = executor.create_task(counting.ask(2))
-        executor.spin_until_future_complete(task, 15.0)
+        executor.spin_until_future_complete(task, patience(15.0))
         assert task.result()[0] == SUCCEEDED and len(counting.server._goal_handles) == 1
         if stepwise:
             assert wait_for(

@@ -161,8 +161,10 @@ def test_programs_run_in_the_process_of_their_nodes(world):
         assert {e['dag'] for e in read_events(f'{name}.mcap', {'mddag:complete'})} == {0}
     live, replayed = (counts(dags['chain']['sinks']['/last:sink']) for dags in (
         result['dags'], replay(['up.mcap', 'down.mcap']).result()['dags']))
-    # in addition to what waited 0.1 s for its announcement, as on a busy machine
-    assert 0 <= replayed.due - live.due <= result['undeclared']
+    # on a busy machine also those whose message waited 0.1 s for its announcement, or did not run
+    lost = sum(each[how] for each in result['callbacks'].values()
+               for how in ('dropped', 'skipped', 'lost'))
+    assert 0 <= replayed.due - live.due <= result['undeclared'] + lost
     assert live.due > 0
     # all traces together make a declaration, with the processes and the measured times
     draft = System(Traces(['up.mcap', 'down.mcap'])).draft()

@@ -112,7 +112,7 @@ def calls_a_service():
     rclpy.init()
     node = Listener('caller')
     client = node.serve()
-    assert client.wait_for_service(5.0)
+    assert client.wait_for_service(60.0)
     future = client.call_async(Trigger.Request())
     rclpy.spin_until_future_complete(node, future, timeout_sec=5.0)
     print(f'answer: {future.result().message}')
