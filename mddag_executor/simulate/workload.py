@@ -91,12 +91,6 @@ def place_of(s: State, load: Workload, x: int) -> int:
             + x - s.job_base[slot])
 
 
-def edges_of(tables: Tables) -> list[int]:
-    """Return the number of edges of each declared DAG."""
-    first = [tables.first_successor[v] for v in tables.first_vertex]
-    return [after - before for before, after in zip(first, first[1:])]
-
-
 def edge_numbers(tables: Tables) -> dict[tuple[int, int], int]:
     """Return the number of each edge in its DAG, by the global vertices that it joins."""
     first = tables.first_successor
