@@ -61,6 +61,14 @@ _MESSAGE_LIMIT = 1 << 30    # bytes of a message, decompressed
 _PIECE = 1 << 20
 _UNPACKED_LIMIT, _MOST_TIMES = 64 * 1024 * 1024, 1000      # what a whole file may become
 _ROWS = 4096                # of an SQLite file that are taken at once
+_MOST_TOPICS = 100_000
+_STEPS, _STEPS_A_BYTE, _SOME_STEPS = 1_000_000, 8, 10_000
+"""
+Of SQLite's machine, which may read a file of some bytes; it counts ``_SOME_STEPS`` at once.
+
+A message takes about twenty steps, and more than that in bytes.
+"""
+_DEFINITIONS_LIMIT = 1024 * 1024    # bytes of the definitions of topics that are used
 _STAMP = 12                 # bytes: encapsulation, seconds, nanoseconds
 _SHORT = b'\xff' * _STAMP
 _WINDOW = 128 * 1024 * 1024
@@ -114,6 +122,7 @@ class Bag:
         self._impossible = 0
         self.warnings: list[str] = []
         self._stamped: dict[tuple[str, str], bool] = {}
+        self._definitions = 0           # bytes of those that were read
         files = self._files()
         for file in files:
             try:
@@ -291,6 +300,10 @@ class Bag:
         key = (topic.message_type, topic.definition)
         stamped = self._stamped.get(key)
         if stamped is None:
+            self._definitions += len(topic.definition)
+            if self._definitions > _DEFINITIONS_LIMIT:
+                raise BagError(self.name, 'the definitions of its message types are too large',
+                               REMEDY)
             stamped = self._stamped[key] = topic.encoding == 'cdr' and _is_stamped(topic)
         if not stamped:
             return np.full(len(heads), UNKNOWN)
@@ -336,7 +349,7 @@ def _named_files(metadata: Path) -> tuple[list[str], int | None]:
                 isinstance(name, str) for name in names):
             raise ValueError('it names no file')
         count = about.get('message_count')
-        return [os.path.basename(name) for name in names], (
+        return [*dict.fromkeys(map(os.path.basename, names))], (
             int(count) if isinstance(count, str) and count.isdecimal() else None)
     except (OSError, ValueError, GraphError) as error:
         what = error.problem if isinstance(error, GraphError) else ' '.join(str(error).split())
@@ -406,17 +419,16 @@ def _rows_of(
     :param known: receives the topics by number; ``topics``: absolute names of the wanted ones.
     :raises _Unreadable: at the first message that cannot be read.
     """
+    steps = None
     try:
+        size = left = os.stat(file).st_size
+        steps = _Steps(size)
         # immutable: reading must not write next to the file
         with closing(sqlite3.connect(
                 f'{file.absolute().as_uri()}?immutable=1', uri=True)) as storage:
-            # a view could take for ever
-            storage.execute('PRAGMA trusted_schema = OFF')
-            views = storage.execute(
-                "SELECT name FROM sqlite_master WHERE type = 'view'").fetchall()
-            if views:
-                raise ValueError('it has views, which ros2 bag does not write')
-            known.update(_topics_of(storage))
+            storage.set_progress_handler(steps, _SOME_STEPS)
+            _check_schema(storage)
+            known.update(_topics_of(storage, size))
             wanted = [number for number, topic in known.items()
                       if _absolute(topic.name) in topics]
             for number, time, data in storage.execute(
@@ -427,20 +439,65 @@ def _rows_of(
                     raise ValueError('the time of a message is none')
                 if not (data is None or isinstance(data, bytes)):
                     raise ValueError('the content of a message is none')
+                left -= len(data or b'')
+                if left < 0:
+                    raise ValueError('its messages are larger than itself')
                 yield number, time, data
     except Exception as error:      # of SQLite, or caused by damaged data
-        raise _Unreadable(' '.join(str(error).split())) from None
+        reason = ' '.join(str(error).split())
+        if steps is not None and steps.left < 0:
+            reason = 'it would take longer than any bag of its size'
+        raise _Unreadable(reason) from None
 
 
-def _topics_of(storage: sqlite3.Connection) -> dict[int, Topic]:
-    """Return the topics of an SQLite file by number; before Iron it has no definitions."""
+class _Steps:
+    """Ends a query that takes longer than any in a bag of this size can (in bytes)."""
+
+    def __init__(self, size: int) -> None:
+        self.left = _STEPS + _STEPS_A_BYTE * size
+
+    def __call__(self) -> bool:
+        self.left -= _SOME_STEPS
+        return self.left < 0
+
+
+def _check_schema(storage: sqlite3.Connection) -> None:
+    """Raise ValueError if a file computes what is read from it, which could take for ever."""
+    storage.execute('PRAGMA trusted_schema = OFF')
+    odd = storage.execute(
+        "SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'CREATE VIRTUAL%'"
+    ).fetchall()
+    if odd:
+        raise ValueError('it has views, which ros2 bag does not write')
+    for table in ('messages', 'topics', 'message_definitions'):
+        if any(column[-1] for column in storage.execute(f'PRAGMA table_xinfo({table})')):
+            raise ValueError('it has computed columns, which ros2 bag does not write')
+
+
+def _topics_of(storage: sqlite3.Connection, size: int) -> dict[int, Topic]:
+    """
+    Return the topics of an SQLite file by number; before Iron it has no definitions.
+
+    :param size: of the file
+    :raises ValueError: if there is more in it than fits into the file
+    """
     definitions: dict[str, tuple[str, str]] = {}
     if storage.execute('PRAGMA table_info(message_definitions)').fetchall():
-        definitions = {kind: (encoding, text) for kind, encoding, text in storage.execute(
-            'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions')}
-    return {number: Topic(name, encoding, kind, *definitions.get(kind, ('', '')))
-            for number, name, kind, encoding in storage.execute(
-                'SELECT id, name, type, serialization_format FROM topics')}
+        for kind, encoding, text in storage.execute(
+                'SELECT topic_type, encoding, encoded_message_definition FROM message_definitions'
+                ):
+            definitions[kind] = encoding, text
+            size -= len(kind) + len(text)
+            if size < 0:
+                raise ValueError('its definitions are larger than itself')
+    topics: dict[int, Topic] = {}
+    for number, name, kind, encoding in storage.execute(
+            'SELECT id, name, type, serialization_format FROM topics'):
+        topics[number] = Topic(name, encoding, kind, *definitions.get(kind, ('', '')))
+        size -= len(name)
+        if size < 0 or len(topics) > _MOST_TOPICS:
+            raise ValueError('it has more topics than any bag')
+    return topics
 
 
 def _is_stamped(topic: Topic) -> bool:

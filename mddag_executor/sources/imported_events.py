@@ -50,7 +50,7 @@ KINDS: dict[str, tuple[Any, ...]] = {
     'ros2:message_construct': (COPY, 'original_message', 'constructed_message'),
     'ros2:rclcpp_ring_buffer_enqueue': (ENQUEUE, 'buffer', 'index', 'overwritten'),
     'ros2:rclcpp_ring_buffer_dequeue': (DEQUEUE, 'buffer', 'index'),
-    'mddag:lost': (LOST, 'count', 'begin'),
+    'mddag:lost': (LOST, 'count', 'begin', 'cause'),
 }
 """By full name of an event its kind, and the fields of its columns ``a``, ``b``, …"""
 OWN_KINDS: dict[str, tuple[Any, ...]] = {

@@ -20,7 +20,7 @@ Events are named by their position in the order of time.
      or its start or end is not recorded.  If the message's source timestamp is known but its
      publication is not, this only affects jobs without a recorded publication with source
      timestamp to this callback;
-   * the tracer discarded events in a gap that had not ended at its release, and had begun when it
+   * events are missing in a gap that had not ended at its release, and had begun when it
      expired.
 
    It is also withdrawn if a callback of one of its uncompleted vertices ever ran for a message

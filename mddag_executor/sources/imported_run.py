@@ -57,7 +57,7 @@ from mddag_executor.sources.imported_jobs import ImportedJobs
 from mddag_executor.sources.links import Links, Oddities
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
-from mddag_executor.trace.schema import HOST
+from mddag_executor.trace.schema import DAMAGED, DISCARDED, HOST, MISSING
 from mddag_executor.trace.times import credible
 from msg_graph import Process, TaskSet
 import numpy as np
@@ -66,6 +66,12 @@ LEAST_UNFINISHED_NS = 1_000_000_000
 """An execution whose end is not recorded, so long before that of the recording, has not ended."""
 _SLACK_NS = 1_000_000
 _OWN = ('mddag:job_release', 'mddag:dispatch')
+_LOST = {
+    DISCARDED: ('the tracer discarded {}', 'event'),
+    MISSING: ('without {} of events, which the tracer has overwritten (flight recorder), or whose '
+              'files were gone (rotated away) when it was imported', 'packet'),
+    DAMAGED: ('damaged in {} of its files when it was imported', 'place')}
+"""By cause what is missing, and what is counted."""
 OFF_THE_GRID = {
     'off': ('execution', 'of timers off the grid of the period (reset, by another clock, or '
             'without initialisation in it): released when it started'),
@@ -87,6 +93,8 @@ class ImportedRun:
     others: Sequence[str] = (*INIT_EVENTS, *_OWN, HOST)
     links_type = Links
     odd = OFF_THE_GRID
+    #: What is missing if no cause is recorded, as before version 3, and what is counted.
+    lost = 'the tracer discarded {} or more, or files were damaged', 'event'
 
     def __init__(
         self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
@@ -418,10 +426,11 @@ class ImportedRun:
         yield from self._matching.losses
         if self._events.warning:
             yield Loss('strange', 1, f'{name}: {self._events.warning}')
-        if self.links.discarded:
-            yield Loss('events', self.links.discarded, (
-                f'{name}: the tracer discarded {counted(self.links.discarded, "event")} or more: '
-                'executions and messages may be missing'))
+        for cause, count in sorted(self.links.gaps.items()):
+            what, things = _LOST.get(cause, self.lost)
+            yield Loss('events', count, (
+                f'{name}: {what.format(counted(count, things))}: executions and messages may be '
+                'missing'))
         for each in self.links.callbacks:   # the messages of a source come from outside
             vertex = self._vertex.get(each.number)
             if vertex is not None and not self.task_set.vertices[vertex].predecessors:

@@ -175,7 +175,11 @@ class Links:
         self.threads = events.threads
         self._pid = np.array([pid for pid, _ in events.threads], dtype=np.int64)
         kind = self.events['kind']
-        self.discarded = int(self.events['a'][kind == LOST].sum())
+        gaps = self.events[kind == LOST]
+        #: How much is lost, by cause (``schema.DISCARDED``, …; 0: not said).
+        self.gaps = Counter[int]()
+        for cause, count in zip(gaps['c'].tolist(), gaps['a'].tolist()):
+            self.gaps[cause] += count
         self._lost = self._gaps()
         # by thread, then by time
         self._order = sort_by(self.events['thread'])

@@ -138,6 +138,7 @@ class UndeclaredRun(ImportedRun):
     kinds = OWN_KINDS
     others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP)
     links_type = _OwnLinks
+    lost = '{} lost while recording', 'event'
     odd = {**OFF_THE_GRID, 'off': (
         'execution', 'of timers whose due times are not recorded and that kept to no period '
         '(reset, or by another clock): released when they were noticed'), 'skipped': (

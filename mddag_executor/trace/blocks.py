@@ -46,6 +46,11 @@ _SUMMARY = (*_USED, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA
             Opcode.SUMMARY_OFFSET)
 _PRIVATE = 0x80     # opcodes from here on belong to others
 _CHUNK_HEAD = 256   # bytes; the name of the compression is short
+_AHEAD = 4096       # bytes that are read at once: heads of records, and short records
+MOST_OTHERS = 50_000
+"""Records without messages, or definitions of these, of a file or of a block."""
+_MOST_INDEXES = 1 << 16     # of a chunk: one for each channel
+_CHUNK = struct.Struct('<QQQI')     # times of the first and last message, size, CRC
 _CRC_PIECE = 1 << 20
 _NUMBER = 2         # bytes of the number of a schema or channel, which comes first
 _FOOTER_SIZE = records.RECORD.size + records.FOOTER_CONTENT.size + len(records.MAGIC)
@@ -95,17 +100,25 @@ class Block:
     :ivar indexes: contents of its message indexes.
     :ivar chunk: the head of the chunk.
     :ivar plain: records outside of chunks.
+    :ivar place: among the blocks whose times are kept.
     """
 
     offset: int
     indexes: list[bytes]
     chunk: ChunkHead | None = None
     plain: bytearray = field(default_factory=bytearray)
+    place: int = 0
 
     @property
     def size(self) -> int:
         """Return the size of its records, unpacked."""
         return len(self.plain) if self.chunk is None else self.chunk.size
+
+    @property
+    def packed(self) -> int:
+        """Return how many bytes of the file it is."""
+        return sum(map(len, self.indexes)) + (
+            len(self.plain) if self.chunk is None else self.chunk.length)
 
     @property
     def is_checked(self) -> bool:
@@ -123,7 +136,9 @@ class Block:
             return
         try:
             _decompress(self.chunk.data(), self.chunk.compression, room)
-        except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
+        except MemoryError:
+            raise Damage(NO_MEMORY, self.offset) from None
+        except (zstandard.ZstdError, RuntimeError, EOFError):
             raise Damage('a chunk cannot be decompressed', self.offset) from None
         except ValueError as error:
             raise Damage(str(error), self.offset) from None
@@ -204,11 +219,14 @@ def blocks(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
     :raises Damage: at the first defect; all blocks before it have been yielded.
     """
     block: Block | None = None
+    others = 0      # records of no use
     try:
-        for opcode, offset, content in _records(stream.fileno(), start, size):
+        for opcode, offset, content, length in _records(stream.fileno(), start, size):
             if opcode == Opcode.MESSAGE_INDEX:
                 if block is None or block.chunk is None:
                     raise Damage('a message index belongs to no chunk', offset)
+                if len(block.indexes) >= _MOST_INDEXES:
+                    raise Damage('a chunk has more message indexes than channels', offset)
                 block.indexes.append(content)
                 continue
             plain = records.record(opcode, content) if opcode in _PLAIN else b''
@@ -220,9 +238,13 @@ def blocks(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
                 yield block
             block = None
             if opcode == Opcode.CHUNK:
-                block = Block(offset, [], chunk=_chunk(stream.fileno(), offset, content))
+                block = Block(offset, [], chunk=_chunk(stream.fileno(), offset, content, length))
             elif plain:
                 block = Block(offset, [], plain=bytearray(plain))
+            others += block is None or not block.size
+            if others > MOST_OTHERS:
+                raise Damage(f'there are more than {MOST_OTHERS} records without messages before '
+                             'it', offset)
     except Damage:
         if block is not None:
             yield block
@@ -231,10 +253,31 @@ def blocks(stream: BinaryIO, start: int, size: int) -> Iterator[Block]:
         yield block
 
 
-def _records(file: int, position: int, size: int) -> Iterator[tuple[int, int, bytes]]:
-    """Yield the records of the data section: opcode, position, content of those that are used."""
+class _Ahead:
+    """Reads pieces of a file that mostly follow each other; short ones from the memory."""
+
+    def __init__(self, file: int) -> None:
+        self._file, self._data, self._begin = file, b'', 0
+
+    def read(self, position: int, length: int) -> bytes:
+        """Return bytes from a position on; fewer at the end of the file."""
+        at = position - self._begin
+        if at < 0 or at + length > len(self._data):
+            if length > _AHEAD:
+                return os.pread(self._file, length, position)
+            self._data, self._begin, at = os.pread(self._file, _AHEAD, position), position, 0
+        return self._data[at:at + length]
+
+
+def _records(file: int, position: int, size: int) -> Iterator[tuple[int, int, bytes, int]]:
+    """
+    Yield the records of the data section: opcode, position, content, length of the content.
+
+    Only those that are used have their contents, and chunks only the begin.
+    """
+    read = _Ahead(file).read
     while True:
-        head = os.pread(file, records.RECORD.size, position)
+        head = read(position, records.RECORD.size)
         if len(head) < records.RECORD.size:
             raise Damage('the file ends without a finish record', position)
         opcode, length = records.RECORD.unpack(head)
@@ -252,19 +295,20 @@ def _records(file: int, position: int, size: int) -> Iterator[tuple[int, int, by
                 raise Damage('a record is too large', position)
             wanted = min(length, _CHUNK_HEAD) if opcode == Opcode.CHUNK else length
             try:
-                content = os.pread(file, wanted, start)
+                content = read(start, wanted)
             except MemoryError:
                 raise Damage(NO_MEMORY, position) from None
             if len(content) < wanted:
                 raise Damage(_SHORTER, position)
-        yield opcode, position, content
+        yield opcode, position, content, length
         position = start + length
 
 
 def _check_tail(file: int, position: int, size: int) -> None:
     """Check that a file ends behind its footer; another one may have been appended to it."""
+    read = _Ahead(file).read
     while position + records.RECORD.size <= size:
-        opcode, length = records.RECORD.unpack(os.pread(file, records.RECORD.size, position))
+        opcode, length = records.RECORD.unpack(read(position, records.RECORD.size))
         position += records.RECORD.size + length
         if opcode == Opcode.FOOTER:
             position += len(records.MAGIC)
@@ -276,16 +320,19 @@ def _check_tail(file: int, position: int, size: int) -> None:
             return      # damage, which reading the summary reports
 
 
-def _chunk(file: int, offset: int, content: bytes) -> ChunkHead:
-    """Return the head of a chunk from the first bytes of its content; Damage: it is wrong."""
-    stream, fixed = Content(content), struct.Struct('<QQQI')
+def _chunk(file: int, offset: int, content: bytes, record: int) -> ChunkHead:
+    """
+    Return the head of a chunk from the first bytes of its content; Damage: it is wrong.
+
+    :param record: the length of its content.
+    """
+    stream = Content(content)
     begin = offset + records.RECORD.size
     try:
-        start, end, size, crc = fixed.unpack(stream.read(fixed.size))
+        start, end, size, crc = _CHUNK.unpack(stream.read(_CHUNK.size))
         compression, length = stream.text(), stream.number(8)
     except ValueError as error:
         raise Damage(str(error), offset) from None
-    record, = struct.unpack('<Q', os.pread(file, 8, offset + 1))
     if stream.at + length > record or size > MAX_CHUNK:
         raise Damage('the lengths in the head of a chunk are wrong', offset)
     return ChunkHead(start, end, size, crc, compression, file, begin + stream.at, length)
@@ -360,9 +407,9 @@ def _summary_records(file: int, position: int, end: int) -> dict[int, list[bytes
     :raises ValueError: if these records do not fill the space from a position to an end.
     """
     found: dict[int, list[bytes]] = {}
-    size = 0
+    size, read = 0, _Ahead(file).read
     while position < end:
-        head = os.pread(file, records.RECORD.size, position)
+        head = read(position, records.RECORD.size)
         if len(head) < records.RECORD.size:
             raise ValueError(_SHORTER)
         opcode, length = records.RECORD.unpack(head)
@@ -373,7 +420,7 @@ def _summary_records(file: int, position: int, end: int) -> dict[int, list[bytes
             size += length
             if size > MAX_CHUNK:
                 raise ValueError('the summary is too large')
-            found.setdefault(opcode, []).append(os.pread(file, length, start))
+            found.setdefault(opcode, []).append(read(start, length))
     return found
 
 

@@ -38,6 +38,8 @@ _TOPIC = re.compile(r'/trace/([A-Za-z][A-Za-z0-9_]*)/([A-Za-z][A-Za-z0-9_]*)')
 _NO_SCHEMA = Schema('', '', b'')
 _T = TypeVar('_T', Channel, Schema)
 DEFINITIONS_LIMIT = 64 * 1024 * 1024        # bytes of all schemas and channels
+DEFINITIONS_PARSED = 8 * 1024 * 1024        # of those of events that are read
+_DECODER = 800      # bytes that a decoder counts for in addition
 
 
 class Topic(NamedTuple):
@@ -73,6 +75,8 @@ class Channels:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._size = 0
+        self._parsed = 0        # bytes of the definitions from which decoders were made
+        self._texts: dict[int, str] = {}        # definitions, by schema
         self._known_schemas: set[bytes] = set()         # contents of their records
         self._known_channels: set[bytes] = set()
         #: The topics of the channels.
@@ -105,14 +109,19 @@ class Channels:
         if number in self.topics:
             return
         schema = self._schemas.get(channel.schema, _NO_SCHEMA)
+        if channel.schema not in self._texts and schema is not _NO_SCHEMA:
+            self._texts[channel.schema] = schema.data.decode(errors='replace')
         topic = self.topics[number] = Topic(
             channel.topic, channel.encoding, schema.name, schema.encoding,
-            schema.data.decode(errors='replace'))
+            self._texts.get(channel.schema, ''))
         match = _TOPIC.fullmatch(topic.name)
         name = f'{match[1]}:{match[2]}' if match else ''
         if match is None or (self._names is not None and name not in self._names):
             self.passed_over.add(number)
             return
+        self._parsed += len(topic.definition) + _DECODER
+        if self._parsed > DEFINITIONS_PARSED:
+            raise ValueError('the definitions of events are too large, or too many')
         try:
             self._decode(number, name, _fields_of(topic))
         except ValueError as error:

@@ -5,7 +5,7 @@ Imports CARET and ros2_tracing recordings: LTTng sessions in the Common Trace Fo
 
 Theory of operation:
 
-1. The packets of the session are read here, on columns (`ctf_layout`, `ctf_stream`), as the
+1. The packets of the session are read here, on columns (`ctf_stream`, `ctf_decoder`), as the
    metadata of CTF 1.8 or 2 describes them (`tsdl`, `ctf2_metadata`); no other program is needed.
    A damaged file is read up to the damage, with a warning.
 2. All traces of a session (processes, kernel, rotated chunks) are read as one stream in the order
@@ -27,8 +27,8 @@ Theory of operation:
    a process, if the metadata names its host, and an event `mddag:process` with `procname` the
    first event of a thread, and each change of its name.
 5. Events discarded by the tracer become an event `mddag:lost` at the end of the gap, which has the
-   time of its begin: the end of the packet before in the same stream; a lost packet
-   counts as at least one event, and a warning reports it.  So does damage.
+   time of its begin: the end of the packet before in the same stream.  So do packets that are not
+   in the files, and damage; a warning reports each of the three.
 6. A tracepoint writes to all sessions that record it before its thread goes on.  So an event that
    equals the one before it in its thread, and that another session recorded, is the same event: it
    is written once (`_Repeats`).
@@ -48,17 +48,17 @@ from mddag_executor.text import counted, listed
 from mddag_executor.trace.cdr import FieldType
 from mddag_executor.trace.columns import Columns, ColumnWriter
 from mddag_executor.trace.ctf2_metadata import is_ctf2, parse_ctf2
-from mddag_executor.trace.ctf_layout import text_of
-from mddag_executor.trace.ctf_stream import (
+from mddag_executor.trace.ctf_events import (
     Array,
     described,
     Events,
     Ints,
     Kind,
     Lost,
-    Reading,
     Rows,
 )
+from mddag_executor.trace.ctf_layout import text_of
+from mddag_executor.trace.ctf_stream import Reading
 from mddag_executor.trace.ctf_types import Metadata, MetadataError, MOST_BYTES
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.numbers import Numbers
@@ -66,9 +66,11 @@ from mddag_executor.trace.schema import (
     BEFORE_HUMBLE,
     BEFORE_HUMBLE_PROBLEM,
     BEFORE_HUMBLE_REMEDY,
+    DISCARDED,
     EVENTS,
     EventType,
     HOST,
+    MISSING,
     PREAMBLE,
     PROCESS,
 )
@@ -95,8 +97,10 @@ class Imported:
     events: int = 0
     kinds: int = 0
     processes: set[int] = field(default_factory=set)
-    #: Number of events that the tracer discarded, as far as it counted them.
+    #: Number of events that the tracer discarded.
     discarded: int = 0
+    #: Number of packets that are not in the files.
+    packets_missing: int = 0
     #: Missing data, one line each.
     warnings: list[str] = field(default_factory=list)
 
@@ -370,7 +374,6 @@ class _Importer:
         self._procnames: dict[int, bytes] = {}      # by process and thread in one number
         self._nameless = 0                          # events without process or thread
         self._impossible = 0                        # events of impossible processes or threads
-        self._uncounted = 0                         # gaps of an unknown number of events
 
     def begin(self, several: bool, host: _Host | None) -> None:
         """
@@ -481,15 +484,14 @@ class _Importer:
 
     def _gaps(self, gaps: Sequence[Lost], order: Ints) -> Columns:
         """Return events that say what is missing."""
-        counts = [max(gap.number, 1) for gap in gaps]
-        for gap, count in zip(gaps, counts):
-            if not gap.damage:
-                self._uncounted += gap.number < 0
-                self.result.discarded += count
+        for gap in gaps:
+            self.result.discarded += gap.number * (gap.cause == DISCARDED)
+            self.result.packets_missing += gap.number * (gap.cause == MISSING)
+        counts, causes = (np.array([each[at] for each in gaps], dtype=np.uint64) for at in (3, 2))
         zeros = np.zeros(len(gaps), dtype=np.int64)
         begins = np.array([max(1, gap.begin) for gap in gaps], dtype=np.int64)
         return Columns(_LOST, order, np.array([gap.time for gap in gaps], dtype=np.int64), zeros,
-                       zeros, [np.minimum(np.array(counts, dtype=np.uint64), 2 ** 62), begins])
+                       zeros, [np.minimum(counts, 2 ** 62), begins, causes])
 
     def _target(self, kind: Kind) -> _Target:
         """Return a kind of event in the trace, which is defined when it is met."""
@@ -540,10 +542,14 @@ class _Importer:
                 f'{path}: {counted(self._repeated, "event")} in more than one session of a host: '
                 'each is used once')
         if result.discarded:
-            about = ' at least' if self._uncounted else ''
             result.warnings.append(
-                f'{path}: the tracer discarded {counted(result.discarded, "event")}{about}: what '
+                f'{path}: the tracer discarded {counted(result.discarded, "event")}: what '
                 'followed from them is missing; record with larger or more sub-buffers')
+        if result.packets_missing:
+            result.warnings.append(
+                f'{path}: {counted(result.packets_missing, "packet")} of events not in it: the '
+                'tracer has overwritten them (flight recorder), or their files are gone (rotated '
+                'away): what followed from them is missing')
         if self.damages:
             result.warnings += self.damages[:_MOST_DAMAGES]
             if len(self.damages) > _MOST_DAMAGES:

@@ -3,10 +3,11 @@
 """
 Where the fields of CTF events are: two ways to read them.
 
-1. *Layouts.*  A structure whose size is known, as that of nearly every event at run time, has a
-   layout: the place of each field.  Many such events become columns at once.  Alignment is
-   relative to the packet, so there is a layout for each place of an event within 8 bytes.
-2. *Readers.*  Anything else (texts, sequences, variants) is read event by event.  Whatever a
+1. *Runs.*  The fields of an event are runs of fields of known sizes, and texts and sequences
+   between them.  A run has a layout: the place of each field.  So many events become columns at
+   once, when it is known where each run begins.  Alignment is relative to the packet, so there is
+   a layout for each place of a run within 8 bytes.  Nearly every event at run time is one run.
+2. *Readers.*  Anything else (variants, arrays of structures) is read event by event.  Whatever a
    reader reads is checked against the end of the packet's content first.
 """
 
@@ -34,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 Path = tuple[str, ...]
+Unpacker = tuple[int, Callable[[bytes, int], tuple[Any, ...]]]
 Bytes = npt.NDArray[np.uint8]
 
 _CODES = {(8, False): 'B', (8, True): 'b', (16, False): 'H', (16, True): 'h',
@@ -125,10 +127,10 @@ class _Place(NamedTuple):
 
 class Layout:
     """
-    Where the fields of structures of a known size are.
+    Where fields of a known size are, which follow each other.
 
     :ivar size: their size in bits.
-    :ivar paths: their fields.
+    :ivar paths: their names.
     """
 
     def __init__(self, places: Sequence[_Place], size: int) -> None:
@@ -145,7 +147,7 @@ class Layout:
         self._number = {path: str(number) for number, path in enumerate(self.paths)}
 
     def rows(self, data: Bytes, starts: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
-        """Return the structures at some places as rows."""
+        """Return the fields at some places as rows."""
         width = self._type.itemsize
         if len(data) < width:
             return np.zeros(0, self._type)
@@ -162,67 +164,214 @@ class Layout:
                 values = (values ^ np.uint64(place.sign)).astype(np.int64) - place.sign
         return values
 
+    def unpacker(self, path: Path) -> Unpacker | None:
+        """Return where an integer is, and what reads it; None: it is not of whole bytes."""
+        place = self._places[path]
+        if place.mask or place.kind[1:] not in _NUMPY:
+            return None
+        return place.offset, struct.Struct(place.kind[0] + _NUMPY[place.kind[1:]]).unpack_from
+
 
 class _NoLayout(Exception):
-    """A structure has no fixed size."""
+    """A structure has fields whose places cannot be found without reading them."""
+
+
+class _Leaf(NamedTuple):
+    """A field that has no fields, and the alignment of what begins with it."""
+
+    path: Path
+    kind: Type
+    align: int
+
+
+class Tail(NamedTuple):
+    """
+    A field of unknown size: a text, or an array whose number of elements is a field.
+
+    :ivar code: numpy's name of an element; empty: it is a text that ends with NUL.
+    :ivar size: bytes of an element.
+    :ivar text: whether the elements are characters.
+    """
+
+    path: Path
+    align: int
+    code: str = ''
+    size: int = 1
+    text: bool = False
+
+
+class Run:
+    """
+    Fields of a known size, and the field of unknown size that follows them, if any.
+
+    :ivar paths: the names of the fields of a known size.
+    :ivar tail: the field of unknown size.
+    :ivar sizes: by place (bytes modulo 8) how many bytes there are before the tail, or before what
+        follows the last field.
+    :ivar counts: of an array by place: where the number of its elements is, and how it is read.
+    """
+
+    def __init__(self, leaves: Sequence[_Leaf], tail: Tail | None, length: Path, rest: int
+                 ) -> None:
+        self.paths = [leaf.path for leaf in leaves]
+        self.tail = tail
+        self.layouts = [_layout(leaves, place, rest) for place in range(_PLACES)]
+        #: Whether the fields are in the same bytes at all places.
+        self._is_even = rest <= 8 and all(leaf.align <= 8 for leaf in leaves)
+        align = max(8, tail.align) if tail else 8
+        self.sizes = [aligned(place * 8 + layout.size, align) // 8 - place
+                      for place, layout in enumerate(self.layouts)]
+        self._unpackers: dict[Path, list[Unpacker]] = {}
+        self.counts = self.unpackers(length) if length else []
+
+    @property
+    def is_whole(self) -> bool:
+        """Return whether what follows begins with a byte."""
+        return all(layout.size % 8 == 0 for layout in self.layouts)
+
+    def unpackers(self, path: Path) -> list[Unpacker]:
+        """Return by place where an integer is, and what reads it; empty: it is of some bits."""
+        if path not in self._unpackers:
+            found = [layout.unpacker(path) for layout in self.layouts]
+            self._unpackers[path] = [each for each in found if each] if all(found) else []
+        return self._unpackers[path]
+
+    def ends(self, begins: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return where the tail begins, or what follows the last field, by begin of the fields."""
+        found: npt.NDArray[np.int64] = begins + np.array(self.sizes, dtype=np.int64)[begins & 7]
+        return found
+
+    def columns(self, data: Bytes, begins: npt.NDArray[np.int64], paths: Sequence[Path]
+                ) -> list[npt.NDArray[Any]]:
+        """Return fields as columns; ``begins`` are the places of the first ones."""
+        if self._is_even or not len(begins):
+            return self._columns(data, begins, paths, 0)
+        places = begins & 7
+        found: list[npt.NDArray[Any]] = []
+        for place in np.flatnonzero(np.bincount(places)).tolist():
+            mine = np.flatnonzero(places == place)
+            if len(mine) == len(begins):
+                return self._columns(data, begins, paths, place)
+            parts = self._columns(data, begins[mine], paths, place)
+            found = found or [np.empty((len(begins), *part.shape[1:]), part.dtype)
+                              for part in parts]
+            for column, part in zip(found, parts):
+                column[mine] = part
+        return found
+
+    def _columns(self, data: Bytes, begins: npt.NDArray[np.int64], paths: Sequence[Path],
+                 place: int) -> list[npt.NDArray[Any]]:
+        layout = self.layouts[place]
+        rows = layout.rows(data, begins)
+        return [layout.column(rows, path) for path in paths]
+
+
+_PLACES = 8
+_NUMPY = {f'{sign}{size}': code.upper() if sign == 'u' else code
+          for sign in 'iu' for size, code in ((1, 'b'), (2, 'h'), (4, 'i'), (8, 'q'))}
 
 
 @lru_cache(65536)
-def layout_of(kinds: tuple[Struct | None, ...], start: int) -> Layout | None:
+def runs_of(kind: Struct) -> tuple[Run, ...] | None:
     """
-    Return the layout of structures, one after another; None if their size is not known.
+    Return the runs that a structure consists of; all but the last have tails.
 
-    :param start: the place of the first, bytes modulo 8.
+    :returns: None if fields have to be read one by one: variants, or arrays of structures.
     """
-    places: list[_Place] = []
-    at = start * 8
+    leaves: list[_Leaf] = []
+    rest = _flatten(kind, (), 1, leaves)
+    if max([rest, *(leaf.align for leaf in leaves)]) > 8 * _PLACES:
+        return None     # places depend on more than the place modulo 8
+    runs, fields = [], list[_Leaf]()
     try:
-        for kind in kinds:
-            if kind is not None:
-                at = _place(kind, at, (), start, places)
+        for leaf in leaves:
+            tail, length = _tail(leaf, fields)
+            if tail is None:
+                fields.append(leaf)
+            else:
+                runs.append(Run(fields, tail, length, 1))
+                fields = []
+        runs.append(Run(fields, None, (), rest))
     except _NoLayout:
         return None
-    return Layout(places, at - start * 8)
+    return tuple(runs)
 
 
-def _place(kind: Type, at: int, path: Path, start: int, places: list[_Place]) -> int:
-    """Note where a field and those in it are, and return the bit after it."""
-    at = aligned(at, kind.align)
-    offset = at // 8 - start
+def _flatten(kind: Type, path: Path, align: int, leaves: list[_Leaf]) -> int:
+    """
+    Add the fields of a type that have no fields.
+
+    :param align: of what begins at the same place.
+    :returns: the alignment of what follows, before its own.
+    """
+    align = max(align, kind.align)
     if isinstance(kind, Struct):
         for name, inner in kind.members:
-            at = _place(inner, at, (*path, name), start, places)
-        return at
+            align = _flatten(inner, (*path, name), align, leaves)
+        return align
+    leaves.append(_Leaf(path, kind, align))
+    return 1
+
+
+def _tail(leaf: _Leaf, before: Sequence[_Leaf]) -> tuple[Tail | None, Path]:
+    """
+    Return the field as a tail, and the field that has the number of its elements.
+
+    :param before: the fields of known sizes just before it.
+    :returns: None if it has a known size itself.
+    """
+    kind = leaf.kind
+    if isinstance(kind, Text):
+        return Tail(leaf.path, leaf.align), ()
+    if not isinstance(kind, Array) or kind.length is None:
+        return None, ()
+    names, origin, above = kind.length
+    length = (*leaf.path[:-1], names[0])
+    number = next((each.kind for each in before if each.path == length), None)
+    element = kind.element
+    code = _code(element) if isinstance(element, Integer) else None
+    if (len(names) > 1 or origin or above > 0 or not isinstance(number, Integer)
+            or _code(number) is None or code is None or element.align > smallest(element)):
+        raise _NoLayout
+    return Tail(leaf.path, leaf.align, code, smallest(element) // 8, kind.text), length
+
+
+def _layout(leaves: Sequence[_Leaf], start: int, rest: int) -> Layout:
+    """Return the layout of fields, the first of which begins at a place (bytes modulo 8)."""
+    places: list[_Place] = []
+    at = start * 8
+    for path, kind, align in leaves:
+        at = aligned(at, align)
+        places.append(_place(kind, at, path, at // 8 - start))
+        at += smallest(kind)
+    return Layout(places, aligned(at, rest) - start * 8)
+
+
+def _place(kind: Type, at: int, path: Path, offset: int) -> _Place:
+    """Return the place of a field; ``at`` is its bit, and ``offset`` its byte from the begin."""
     if isinstance(kind, Enumeration):
         kind = kind.container
     if isinstance(kind, Integer):
         size = kind.bits
         code = _code(kind)
         if code and at % 8 == 0:
-            places.append(_Place(path, offset, code))
-        else:
-            width = -(-(at % 8 + size) // 8)
-            width = next((bytes_ for bytes_ in (1, 2, 4, 8) if bytes_ >= width), 0)
-            if not width or kind.signed and size == 64:
-                raise _NoLayout
-            shift = width * 8 - at % 8 - size if kind.big else at % 8
-            places.append(_Place(
-                path, offset, f'{">" if kind.big else "<"}u{width}', shift, (1 << size) - 1,
-                1 << size - 1 if kind.signed else 0))
-    elif isinstance(kind, Float) and at % 8 == 0:
-        size = kind.bits
-        places.append(_Place(path, offset, f'{">" if kind.big else "<"}f{size // 8}'))
-    elif isinstance(kind, Array) and 0 < kind.count < 2 ** 20 and at % 8 == 0:
-        element = kind.element
-        size = kind.count * smallest(element)
-        code = _code(element) if isinstance(element, Integer) else None
-        if code is None or element.align > smallest(element):
+            return _Place(path, offset, code)
+        width = -(-(at % 8 + size) // 8)
+        width = next((bytes_ for bytes_ in (1, 2, 4, 8) if bytes_ >= width), 0)
+        if not width or kind.signed and size == 64:
             raise _NoLayout
-        places.append(_Place(
-            path, offset, f'S{kind.count}' if kind.text else f'({kind.count},){code}'))
-    else:
-        raise _NoLayout
-    return at + size
+        shift = width * 8 - at % 8 - size if kind.big else at % 8
+        return _Place(path, offset, f'{">" if kind.big else "<"}u{width}', shift,
+                      (1 << size) - 1, 1 << size - 1 if kind.signed else 0)
+    if isinstance(kind, Float) and at % 8 == 0:
+        return _Place(path, offset, f'{">" if kind.big else "<"}f{kind.bits // 8}')
+    if isinstance(kind, Array) and 0 < kind.count < 2 ** 20 and at % 8 == 0:
+        element = kind.element
+        code = _code(element) if isinstance(element, Integer) else None
+        if code is not None and element.align <= smallest(element):
+            return _Place(path, offset,
+                          f'S{kind.count}' if kind.text else f'({kind.count},){code}')
+    raise _NoLayout
 
 
 def _code(kind: Integer) -> str | None:

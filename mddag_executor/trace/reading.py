@@ -19,6 +19,9 @@ Theory of operation
    before 1970 or after 2116 are skipped as well: a simulation of them would never end.
 6. If messages of some topics are wanted, a chunk is only unpacked if its message indexes name one
    of these, or a channel that the summary does not have.  Its times are then those of the indexes.
+7. The indexes of several chunks are used at once; if anything in them is wrong, chunk by chunk.
+8. A small file can say that it has a lot.  A file with more messages than bytes, or with very many
+   records that have none, is damaged: equal messages would have different times.
 """
 
 from __future__ import annotations
@@ -33,7 +36,14 @@ from typing import Any, BinaryIO, NamedTuple
 from mcap.opcode import Opcode
 from mddag_executor.text import counted
 from mddag_executor.trace import records
-from mddag_executor.trace.blocks import Block, blocks, Damage, NO_MEMORY, Summary
+from mddag_executor.trace.blocks import (
+    Block,
+    blocks,
+    Damage,
+    MOST_OTHERS,
+    NO_MEMORY,
+    Summary,
+)
 from mddag_executor.trace.cdr import ENCAPSULATION
 from mddag_executor.trace.channels import Channels, Topic, UNDEFINED
 from mddag_executor.trace.events import Batch, Event, Ints, rows_at, Table, with_fields
@@ -46,7 +56,7 @@ _HEAD = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2')])
 _TIMES_AT, _TIMES = 15, np.dtype([('log_time', '<u8'), ('publish_time', '<u8')])
 _CONTENT = records.RECORD.size
 _ROW = 16               # records that are compared at once; then eight times as many
-_MOST_OTHERS = 100_000  # records in a block that are neither messages nor definitions
+_FEW = 100_000          # messages that a file may have whatever its size
 _LEAST = _CONTENT + records.MESSAGE_HEAD.size       # bytes of a message's record
 _FIELDS = _LEAST + len(ENCAPSULATION)       # bytes before the fields of an event
 _PLAIN = int.from_bytes(ENCAPSULATION[:2], 'little')
@@ -119,6 +129,7 @@ class Reading:
     ) -> None:
         self.chunks = 0             # used
         self.messages = 0           # in used chunks, of all channels
+        self._packed = 0            # bytes of what is used, packed
         self.damage: Damage | None = None
         self._path, self._channels = path, channels
         self._blocks = blocks(stream, start, size)
@@ -161,9 +172,8 @@ class Reading:
             self._undecoded.update(
                 f'channel {channel}: {UNDEFINED}' for channel in undefined.tolist())
             found = []
-            for channel in np.flatnonzero(np.bincount(channels)).tolist():
+            for channel, mine in _by_channel(channels):
                 if channel in known and known[channel].name in topics:
-                    mine = np.flatnonzero(channels == channel)
                     found.append(Messages(
                         known[channel], heads['log_time'][mine], heads['publish_time'][mine],
                         at[mine] + _LEAST, lengths[mine] - records.MESSAGE_HEAD.size, data))
@@ -205,58 +215,118 @@ class Reading:
         if len(times) and not block.chunk.start <= times.min() <= times.max() <= block.chunk.end:
             return False
         self._times.append(times)
-        self.chunks += 1
-        self.messages += len(times)
+        self._count([block], len(times))
         return True
 
     # --- positions of messages -------------------------------------------------------------------
 
     def _messages(self) -> Iterator[_Loaded]:
         """Yield the messages of all blocks, some blocks at a time."""
-        places: list[tuple[Ints, Ints, Any]] = []
+        some: list[Block] = []      # in the buffer, one after another
         size = 0
-        try:
-            for block in self._blocks:
+        damage: Damage | None = None
+        left = iter(self._blocks)
+        while damage is None:
+            block = None
+            try:
+                block = next(left, None)
+                if block is None:
+                    break
                 if self._is_skipped(block):
                     continue
                 if size and size + block.size > _BATCH_BYTES:
-                    yield _Loaded(self._buffer, *map(np.concatenate, zip(*places)))
+                    loaded, damage = self._loaded(some, size)
+                    yield loaded
                     self._place += size
-                    places, size = [], 0
+                    some, size = [], 0
+                    if damage is not None:
+                        break
                 if size + block.size > len(self._buffer):   # only the first of a batch
                     self._buffer = bytearray(max(block.size, _BATCH_BYTES))
-                room = memoryview(self._buffer)[size:size + block.size]
-                block.unpack(room)
-                at, lengths, channels, defect = self._located(room, block.indexes)
-                if defect is not None and block.chunk is not None and not block.is_checked:
-                    raise Damage(defect.what, block.offset)
-                self.chunks += block.chunk is not None and defect is None
-                self.messages += len(at)
+                block.unpack(memoryview(self._buffer)[size:size + block.size])
+                some.append(block)
                 if self._times is not None:
-                    self._times.append(rows_at(room, _TIMES, at + _TIMES_AT)['log_time'].copy())
-                places.append((at + size, lengths, channels))
+                    block.place = len(self._times)
+                    self._times.append(np.empty(0, dtype=np.uint64))
                 size += block.size
-                if defect is not None:
-                    raise Damage(defect.what, block.offset + (
-                        defect.position if block.chunk is None else 0))
-        except Damage as damage:
-            self.damage = Damage(damage.what, damage.offset)    # no traceback: it keeps the data
+            except Damage as error:
+                damage = Damage(error.what, error.offset)   # no traceback: it keeps the data
+            except MemoryError:
+                damage = Damage(NO_MEMORY, block.offset if block else 0)
+        if some:
+            loaded, earlier = self._loaded(some, size)
+            damage = earlier or damage
+            yield loaded
+        self.damage = damage
+
+    def _loaded(self, some: Sequence[Block], size: int) -> tuple[_Loaded, Damage | None]:
+        """Return the messages of unpacked blocks, and the first damage in these."""
+        none = np.empty(0, dtype=np.int64)
+        places: list[tuple[Ints, Ints, Any]] = [(none, none, none.astype(np.uint16))]
+        begins = np.append(0, np.cumsum([block.size for block in some], dtype=np.int64))
+        data = memoryview(self._buffer)[:size]
+        damage = None
+        try:
+            at, lengths, channels, defect = self._located(data, some, begins)
+            if defect is None:
+                places.append((at, lengths, channels))
+                self._count(some, len(at))
+                self._keep_times(data, some, begins, at)
+            else:
+                damage = self._some(data, some, begins, places)
         except MemoryError:
-            self.damage = Damage(NO_MEMORY, block.offset)
-        if places:
-            yield _Loaded(self._buffer, *map(np.concatenate, zip(*places)))
+            damage = Damage(NO_MEMORY, some[0].offset)
+        if damage is None and self.messages > _FEW + self._packed:
+            damage = Damage('up to it there are more messages than bytes, as in no recording',
+                            some[-1].offset)
+        return _Loaded(self._buffer, *map(np.concatenate, zip(*places))), damage
+
+    def _some(self, data: memoryview, some: Sequence[Block], begins: Ints,
+              places: list[tuple[Ints, Ints, Any]]) -> Damage | None:
+        """Add the messages of blocks before the first defect, and return this."""
+        for block, begin, end in zip(some, begins.tolist(), begins[1:].tolist()):
+            at, lengths, channels, defect = self._located(
+                data[begin:end], [block], np.array([0, end - begin]))
+            if defect is not None and block.chunk is not None and not block.is_checked:
+                return Damage(defect.what, block.offset)
+            places.append((at + begin, lengths, channels))
+            self._count([block] if defect is None else [], len(at))
+            self._keep_times(data[begin:end], [block], np.array([0, end - begin]), at)
+            if defect is not None:
+                return Damage(defect.what, block.offset + (
+                    defect.position if block.chunk is None else 0))
+        return None
+
+    def _keep_times(self, data: memoryview, some: Sequence[Block], borders: Ints, at: Ints
+                    ) -> None:
+        """Keep the times of the messages of blocks, if they are wanted."""
+        if self._times is None:
+            return
+        times = rows_at(data, _TIMES, at + _TIMES_AT)['log_time']
+        ends = np.searchsorted(at, borders).tolist()
+        for block, begin, end in zip(some, ends, ends[1:]):
+            self._times[block.place] = times[begin:end].copy()
+
+    def _count(self, some: Sequence[Block], messages: int) -> None:
+        """Count what is used."""
+        self.chunks += sum(block.chunk is not None for block in some)
+        self._packed += sum(block.packed for block in some)
+        self.messages += messages
 
     def _located(
-        self, data: memoryview, indexes: Sequence[bytes]
+        self, data: memoryview, some: Sequence[Block], borders: Ints
     ) -> tuple[Ints, Ints, Any, _Defect | None]:
         """
-        Return positions, lengths and channels of the messages in a block; read its definitions.
+        Return positions, lengths and channels of the messages in blocks; read their definitions.
 
         Those of messages before the first wrong record, which is also returned.
+
+        :param borders: where the blocks begin in the data, and where the last one ends.
         """
-        at, lengths, channels = _indexed(data, indexes)
+        at, lengths, channels = _indexed(data, some, borders)
         # definitions are between the messages; without usable indexes, so are all messages
-        ends, begins = np.append(0, at + _CONTENT + lengths), np.append(at, len(data))
+        ends = np.sort(np.concatenate((borders[:-1], at + _CONTENT + lengths)), kind='stable')
+        begins = np.sort(np.concatenate((at, borders[1:])), kind='stable')
         gaps = np.flatnonzero(ends < begins)
         found: list[Ints] = []
         defect = None
@@ -307,7 +377,7 @@ class Reading:
                 what = 'a record is where it cannot be'
             else:
                 others += 1
-                if others > _MOST_OTHERS:
+                if others > MOST_OTHERS:
                     what = 'a chunk is full of records that do not belong there'
             position += size if what is None else 0
         if single:
@@ -319,10 +389,9 @@ class Reading:
     def _decoded(self, loaded: _Loaded) -> Batch:
         """Return the events of some blocks; count undecodable ones."""
         tables, others = list[Table](), list[tuple[int, Event]]()
-        for channel in np.flatnonzero(np.bincount(loaded.channels)).tolist():
+        for channel, mine in _by_channel(loaded.channels):
             if channel in self._channels.passed_over:
                 continue
-            mine = np.flatnonzero(loaded.channels == channel)
             reason = self._channels.undecodable(channel)
             if reason is not None:
                 self._undecoded[f'{self._named(channel)}: {reason}'] += len(mine)
@@ -394,20 +463,38 @@ def _row(data: memoryview, position: int, size: int, end: int) -> Ints:
     return position + size * np.arange(1, count + 1, dtype=np.int64)
 
 
-def _indexed(data: memoryview, indexes: Sequence[bytes]) -> tuple[Ints, Ints, Any]:
-    """Return what the message indexes say of a block's messages; nothing if they are wrong."""
+def _by_channel(channels: Any) -> Iterator[tuple[int, Ints]]:
+    """Yield each channel, and which messages are of it."""
+    order = np.argsort(channels, kind='stable')
+    counts = np.bincount(channels)
+    ends = np.cumsum(counts)
+    for channel in np.flatnonzero(counts).tolist():
+        end = int(ends[channel])
+        yield channel, order[end - int(counts[channel]):end]
+
+
+def _indexed(
+    data: memoryview, some: Sequence[Block], borders: Ints
+) -> tuple[Ints, Ints, Any]:
+    """Return what the message indexes say of blocks' messages; nothing if they are wrong."""
     none = np.empty(0, dtype=np.int64)
     nothing = none, none, none.astype(np.uint16)
-    try:
-        entries = [np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD) for index in indexes]
-    except ValueError:      # not a number of whole entries
-        return nothing
-    at = np.concatenate([none, *(each['offset'].astype(np.int64) for each in entries)])
+    parts = [none]
+    for block, begin in zip(some, borders.tolist()):
+        for index in block.indexes:
+            try:
+                offsets = np.frombuffer(index, _INDEX_ENTRY, offset=_INDEX_HEAD)['offset']
+            except ValueError:      # not a number of whole entries
+                return nothing
+            parts.append(offsets.astype(np.int64) + begin)
+    at = np.concatenate(parts)
     at.sort(kind='stable')      # fast: each index ascends
     if not len(at) or at[0] < 0 or at[-1] > len(data) - _LEAST:
         return nothing
     heads = rows_at(data, _HEAD, at)
     lengths = heads['length'].astype(np.int64)
+    ends = borders[np.searchsorted(borders, at, 'right')]       # of the blocks
+    ends[:-1] = np.minimum(ends[:-1], at[1:])
     fits = (heads['opcode'] == Opcode.MESSAGE) & (lengths >= records.MESSAGE_HEAD.size) & (
-        lengths <= len(data)) & (at + _CONTENT + lengths <= np.append(at[1:], len(data)))
+        lengths <= len(data)) & (at + _CONTENT + lengths <= ends)
     return (at, lengths, heads['channel']) if fits.all() else nothing

@@ -19,6 +19,12 @@ from mddag_executor.trace.cdr import FieldType
 GOES_ON = -2
 """Instead of a job, in ``dispatch`` of an undeclared execution that is suspended and goes on."""
 
+DISCARDED, MISSING, DAMAGED = 1, 2, 3
+"""
+Why events of an imported recording are lost: the tracer discarded so many; so many packets are not
+in its files; or so many places of its files are damaged.
+"""
+
 PREAMBLE = (('timestamp', 'int64'), ('vpid', 'int32'), ('vtid', 'int32'))
 
 BEFORE_HUMBLE = ('ros2_hook:dds_write', 'ros2_hook:take_type_erased', 'dds:write_pre')
@@ -173,8 +179,8 @@ _ALL = (
     _event('mddag', 'stop', begin=_I64, end=_I64),
     # the system clock was set forward by so much, which moves timers and stamps
     _event('mddag', 'clock_step', step=_I64),
-    # events that were lost up to now, and since when, 0: unknown
-    _event('mddag', 'lost', (0,), count=_I64, begin=_I64),
+    # what was lost up to now, and since when, 0: unknown; why (`DISCARDED`, …; 0: not said)
+    _event('mddag', 'lost', (0, 0), count=_I64, begin=_I64, cause=_I32),
     _event('mddag', 'shutdown', end=_I64),
     # imported recordings: the name of the event's thread from here on
     _event('mddag', 'process', procname=_STR),

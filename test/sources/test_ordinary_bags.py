@@ -464,6 +464,87 @@ def test_views_are_not_read(tmp_path):
         Bag(path, ())
 
 
+ROWS = """
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format);
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data{computed});
+INSERT INTO topics VALUES (1, '/points', 'std_msgs/msg/Header', 'cdr');
+WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n WHERE id < {count})
+INSERT INTO messages(id, topic_id, timestamp{data}) SELECT id, 1, id{zeros} FROM n;
+"""
+
+
+def storage_of(path, count=2000, computed=''):
+    """Write the SQLite file of a bag, and return its bytes."""
+    with closing(sqlite3.connect(path)) as storage:
+        storage.execute('PRAGMA page_size = 512')
+        storage.executescript(ROWS.format(
+            count=count, computed=computed, data='' if computed else ', data',
+            zeros='' if computed else ", x'00'"))
+    return bytearray(path.read_bytes())
+
+
+def test_what_a_file_computes_is_not_read(tmp_path):
+    """Each message would have a gigabyte."""
+    storage_of(tmp_path / 'a.db3', computed=' AS (zeroblob(1000000000))')
+    with pytest.raises(BagError, match='it has computed columns'):
+        Bag(tmp_path / 'a.db3', {'/points'})
+
+
+def test_pages_that_are_there_many_times_are_not_read_for_ever(tmp_path):
+    """All pointers of a page are to one page, and those of this to another one, ten times."""
+    path = tmp_path / 'a.db3'
+    data = storage_of(path)
+    pages = [data[at:at + 512] for at in range(0, len(data), 512)]
+    inner = [number for number, page in enumerate(pages, 1) if number > 1 and page[0] == 5]
+
+    def pointing_to(page, child):
+        """Return a page of a table whose children are all the same one."""
+        page, n = bytearray(page), struct.unpack('>H', page[3:5])[0]
+        for place in [8, *struct.unpack(f'>{n}H', page[12:12 + 2 * n])]:
+            page[place:place + 4] = struct.pack('>I', child)
+        return page
+
+    child = next(number for number, page in enumerate(pages, 1) if page[0] == 13 and number > 3)
+    for _ in range(10):
+        pages.append(pointing_to(pages[inner[0] - 1], child))
+        child = len(pages)
+    for number in inner:
+        pages[number - 1] = pointing_to(pages[number - 1], child)
+    data = bytearray(b''.join(pages))
+    data[28:32] = struct.pack('>I', len(pages))
+    path.write_bytes(data)
+    for topics, says in (((), 'it would take longer than any bag of its size'),
+                         ({'/points'}, 'its messages are larger than itself')):
+        bag = Bag(path, topics)
+        assert f'its SQLite storage cannot be read ({says}): used' in bag.warnings[0]
+        assert 2000 < bag.count < 1_000_000
+
+
+def test_a_topic_with_many_types_is_not_read_for_ever(tmp_path):
+    """Each would be parsed."""
+    path = tmp_path / 'a.mcap'
+    with path.open('wb') as file:
+        writer = McapWriter(file)
+        writer.start()
+        for number in range(300):
+            schema = writer.register_schema(
+                f'a/msg/B{number}', 'ros2msg', b'int32 a\n' * 1000)
+            channel = writer.register_channel('/points', 'cdr', schema)
+            writer.add_message(channel, BEGIN, bytes(20), BEGIN)
+        writer.finish()
+    with pytest.raises(BagError, match='the definitions of its message types are too large'):
+        Bag(path, {'/points'})
+
+
+def test_a_file_that_metadata_names_twice_is_read_once(tmp_path):
+    path = write_bag(tmp_path / 'bag', MCAP)
+    metadata = path / 'metadata.yaml'
+    name = next(each.name for each in path.iterdir() if each.name != 'metadata.yaml')
+    metadata.write_text(
+        f'rosbag2_bagfile_information: {{relative_file_paths: [{name}, {name}]}}\n')
+    assert Bag(path, {'/points'}).count == 11
+
+
 GRAPH_OF_DRAWN = """\
 mddag: 1
 nodes:

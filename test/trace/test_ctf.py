@@ -4,11 +4,14 @@
 
 import json
 import pickle
+import random
 import re
 import struct
 import subprocess
 
 from mddag_executor.trace import import_ctf, read_events, TraceError, TraceReader
+from mddag_executor.trace.ctf_decoder import Decoder
+from mddag_executor.trace.schema import DAMAGED, DISCARDED, MISSING
 import pytest
 
 from ..sources.caret import CARET
@@ -91,6 +94,92 @@ def test_one_event_with_other_fields_in_another_process(tmp_path):
         (11,), (22,)]
 
 
+def _aligned(at, bits):
+    return at + -at % (bits // 8)
+
+
+def _whole(bits, align):
+    return f'integer {{ size = {bits}; align = {align}; }}'
+
+
+# Fields that are aligned as on ARM, texts and sequences: TSDL, and what is written at a place.
+PARTS = {
+    'byte': (_whole(8, 8), lambda rng, at: rng.randbytes(1)),
+    'id': (_whole(32, 32), lambda rng, at: bytes(_aligned(at, 32) - at) + b'\1\0\0\0'),
+    'word': (_whole(32, 32), lambda rng, at: bytes(_aligned(at, 32) - at) + rng.randbytes(4)),
+    'long': (_whole(64, 64), lambda rng, at: bytes(_aligned(at, 64) - at) + rng.randbytes(8)),
+    'text': ('string', lambda rng, at: bytes(rng.choices(range(1, 128), k=rng.randrange(9)))
+             + b'\0')}
+
+
+def _sequence(rng, at, bits):
+    """Return a number of elements, and the elements."""
+    count = rng.randrange(4)
+    begin = _aligned(at + 1, bits)
+    return bytes([count]) + bytes(begin - at - 1) + rng.randbytes(count * bits // 8)
+
+
+@pytest.mark.parametrize('context', [True, False])
+@pytest.mark.parametrize('seed', range(30))
+def test_columns_are_what_is_read_event_by_event(context, seed, tmp_path, monkeypatch):
+    """Texts and sequences in any order, in contexts and fields, at all places; also if cut."""
+    rng = random.Random(seed)
+    layouts = [[rng.choice(['byte', 'word', 'long', 'text', 'bytes', 'longs'])
+                for _ in range(rng.randrange(5))] for _ in range(3)]
+    common = ['text', 'longs'] if context else []
+
+    def declared(names, prefix):
+        found = ''
+        for place, name in enumerate(names):
+            if name in PARTS:
+                found += f'{PARTS[name][0]} {prefix}{place}; '
+            else:
+                bits = 8 if name == 'bytes' else 64
+                found += (f'{_whole(8, 8)} n{prefix}{place}; {_whole(bits, bits)} '
+                          f'{prefix}{place}[n{prefix}{place}]; ')
+        return found
+
+    folder = session(tmp_path / 's', [(f'my:k{n}', []) for n in range(3)], [], context=False)
+    text = (folder / 'metadata').read_text().replace(
+        'event.context := struct {  }', f'event.context := struct {{ {_whole(32, 32)} _vpid; '
+        f'{_whole(32, 32)} _vtid; {declared(common, "_procname")}}}').replace(
+            '_procname0;', '_procname;')
+    for number, names in enumerate(layouts):
+        text = text.replace(f'id = {number}; stream_id = 0; fields := struct {{  }}',
+                            f'id = {number}; stream_id = 0; fields := struct {{ '
+                            f'{declared(names, "f")} }}')
+    (folder / 'metadata').write_text(text)
+    body = b''
+
+    def write(names):
+        nonlocal body
+        aligns = {'id': 32, 'word': 32, 'long': 64, 'longs': 64}
+        at = 56 + len(body)
+        body += bytes(_aligned(at, max([8, *(aligns.get(name, 8) for name in names)])) - at)
+        for name in names:
+            at = 56 + len(body)
+            body += PARTS[name][1](rng, at) if name in PARTS else _sequence(
+                rng, at, 8 if name == 'bytes' else 64)
+
+    for event in range(200):
+        kind = rng.randrange(3)
+        body += struct.pack('<IQ', kind, event)
+        write(['id', 'id', *common])
+        write(layouts[kind])
+    bits = (56 + len(body)) * 8
+    data = struct.pack('<IIQQQQQQ', 0xC1FC1FC1, 0, 0, 1000, bits, bits, 0, 0) + body
+    for cut in (len(data), rng.randrange(100, len(data))):
+        (folder / 'channel_0').write_bytes(data[:cut])
+        found = []
+        for chain in (Decoder.chain, lambda *_: None):
+            monkeypatch.setattr(Decoder, 'chain', chain)
+            result = import_ctf(folder, tmp_path / 'out.mcap', overwrite=True)
+            found.append((result, contents(tmp_path / 'out.mcap')))
+            monkeypatch.undo()
+        assert found[0] == found[1]
+        assert found[0][0].events == 200 or cut < len(data)
+
+
 @pytest.mark.parametrize(('options', 'says'), [
     ({'discarded': 17}, 'discarded 17 events'), ({'context': False}, 'vpid and vtid')])
 def test_events_that_are_discarded_or_have_no_context_are_warned_of(tmp_path, options, says):
@@ -145,7 +234,7 @@ def test_ctf2_is_read_as_ctf_1_8(head, order, ids, renamed, tmp_path):
         discarded=5, environment={'hostname': 'robot', 'tracer_major': 2}, boot='a-b')
     first = import_ctf(folder, tmp_path / 'ctf1.mcap')
     second = import_ctf(to_ctf2(folder, packets=True, renamed=renamed), tmp_path / 'ctf2.mcap')
-    assert second == first and first.discarded == 6
+    assert second == first and (first.discarded, first.packets_missing) == (5, 1)
     assert contents(tmp_path / 'ctf2.mcap') == contents(tmp_path / 'ctf1.mcap')
 
 
@@ -305,6 +394,29 @@ def test_a_count_of_discarded_events_that_goes_back_is_no_gap(tmp_path):
         (1, 2, 0), (3, 3, 1), (7, 2, 5)]    # since the end of the packet before
 
 
+def test_discarded_events_missing_packets_and_damage_are_told_apart(tmp_path):
+    """Files of a rotated session may be gone, a flight recorder overwrites packets."""
+    folder = session(tmp_path / 's', [END], [(0, time, 1, 1, 'p', 3) for time in range(12)],
+                     packets=[2, 3, -1, 5], discarded=[0, 0, 0, 4])
+    result = import_ctf(folder, tmp_path / 'out.mcap')
+    assert (result.discarded, result.packets_missing) == (4, 3)
+    assert re.fullmatch(r'.*: the tracer discarded 4 events: .*', result.warnings[0])
+    assert re.fullmatch(r'.*: 3 packets of events not in it: .* gone \(rotated away\): .*',
+                        result.warnings[1])
+
+    def gaps():
+        return [(event[1] - CLOCK_OFFSET, event[4], max(0, event[5] - CLOCK_OFFSET), event[6])
+                for event in TraceReader(tmp_path / 'out.mcap').events({'mddag:lost'})]
+
+    assert gaps() == [(0, 2, 0, MISSING), (9, 1, 5, MISSING), (11, 4, 5, DISCARDED)]
+    stream = folder / 'channel_0'
+    data = stream.read_bytes()
+    stream.write_bytes(data[:len(data) // 3] + bytes(100))
+    result = import_ctf(folder, tmp_path / 'out.mcap', overwrite=True)
+    assert (result.discarded, result.packets_missing, len(result.warnings)) == (0, 2, 2)
+    assert [cause for *_, cause in gaps()] == [MISSING, DAMAGED]
+
+
 def test_cut_metadata_is_one_error(tmp_path):
     head = struct.pack('<I16sIII5B', 0x75D11D57, b'', 0, 1000 * 8, 4096 * 8, 0, 0, 0, 1, 8)
     for data, what in ((head + bytes(3000), 'is cut or damaged at byte 0'), (head[:20], 'is cut'),
@@ -459,7 +571,8 @@ def test_babeltrace_reads_the_same(head, order, ids, tmp_path):
     gaps = re.findall(r'Tracer discarded (\d+) (event|packet)', done.stderr)
     assert [int(count) for count, kind in gaps if kind == 'event'] == [5]
     assert [kind for _, kind in gaps].count('packet') == 1
-    assert 'discarded 6 events at least' in result.warnings[0]
+    assert 'discarded 5 events:' in result.warnings[0]
+    assert ': 1 packet of events not in it: ' in result.warnings[1]
 
 
 class Plain(pickle.Unpickler):
