@@ -1,14 +1,32 @@
 // Draws the pictures of a report on canvases and makes its tables sortable and searchable.
 // All times are nanoseconds since the start of the recording. Names are only ever set as text.
 'use strict';
-(() => {
+(async () => {
   const element = (id) => document.getElementById(`mddag-${id}`);
-  const data = JSON.parse(element('data').textContent);
+  if (!window.DecompressionStream) {
+    element('status').textContent = 'This browser is too old for the pictures of this page: it ' +
+      'has no DecompressionStream.';
+    return;
+  }
+  const packed = Uint8Array.from(atob(element('data').textContent), (char) => char.charCodeAt(0));
+  const data = await new Response(
+    new Blob([packed]).stream().pipeThrough(new DecompressionStream('deflate'))).json();
   const bars = data.executions, verdicts = data.verdicts, count = bars.name.length;
   const LEFT = 290, RIGHT = 30, LINE = 17, AXIS = 34, MOST_LINES = 100;
   const COLOURS = ['missed', 'least', 'less', 'more', 'most', 'unknown'];
-  let sum = 0;
-  bars.start = bars.start.map((step) => (sum += step));
+
+  function added(steps, unit) {       // times and numbers are stored as steps
+    let sum = 0;
+    return steps.map((step) => (sum += step) * unit);
+  }
+
+  bars.start = added(bars.start, 1e3);
+  verdicts.release = added(verdicts.release, 1e3);
+  const jobs = added(data.jobs.job, 1), releases = new Map();
+  added(data.jobs.release, 1e3).forEach((release, i) => {
+    releases.set(`${data.jobs.dag[i]} ${jobs[i]}`, release);
+  });
+  const verdictOf = new Map(verdicts.job.map((job, i) => [`${verdicts.sink[i]} ${job}`, i]));
 
   // --- texts -------------------------------------------------------------------------------------
 
@@ -38,15 +56,18 @@
   }
 
   function barText(i) {
-    const name = bars.name[i], verdict = bars.verdict[i], released = bars.released[i];
+    const name = bars.name[i], verdict = verdictOf.get(`${bars.sink[i]} ${bars.job[i]}`);
     const declared = name < data.declared;
+    const release = releases.get(`${data.dagOf[name]} ${bars.job[i]}`);
     const lines = [data.names[name]];
     lines.push(!declared ? 'declared by no DAG' : `job ${bars.job[i]} of ` +
       data.dags[data.dagOf[name]] +
-      (released === null ? '' : `, released at ${at(bars.start[i] - released)}`));
+      (release === undefined ? '' : `, released at ${at(release)}`));
     lines.push(`started ${at(bars.start[i])} on ${data.workers[bars.worker[i]]}, waited ` +
       `${time(bars.waited[i])}, ran ${time(bars.ran[i])}`);
-    if (declared) lines.push(verdict >= 0 ? verdictText(verdict) : 'no verdict known');
+    if (declared) {
+      lines.push(verdict === undefined ? 'no verdict known' : verdictText(verdict));
+    }
     return lines.join('\n');
   }
 

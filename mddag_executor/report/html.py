@@ -19,7 +19,7 @@ from mddag_executor.core.requirements import as_dags, not_met
 from mddag_executor.core.tally import total
 from mddag_executor.recording.columns import Ints
 from mddag_executor.report.explained import causes_line
-from mddag_executor.report.html_data import json_for_html, page_data, ReportData, shown_misses
+from mddag_executor.report.html_data import packed, page_data, ReportData, shown_misses
 from mddag_executor.report.html_tables import (
     callbacks_html,
     data_table,
@@ -146,8 +146,8 @@ def _page(data: ReportData, misses: Ints) -> Iterator[str]:
         yield data_table(html_table(*communications_table(data.result['communications']), 3),
                          'search messages', name='messages')
     yield f'<footer>mddag_executor {escape(__version__)}</footer>\n'
-    yield ('<script id="mddag-data" type="application/json">'
-           f'{json_for_html(page_data(data, misses))}</script>\n'
+    yield ('<script id="mddag-data" type="application/octet-stream">'
+           f'{packed(page_data(data, misses))}</script>\n'
            f'<script>{_SCRIPT.read_text(encoding="utf-8")}</script>\n</body></html>\n')
 
 

@@ -5,22 +5,25 @@ The data of an HTML report, from which its script draws the timelines and histog
 
 The page has the executions and verdicts that ``timeline`` selects, as columns of numbers that
 refer to lists of names; the script makes the texts of tool tips. So a page stays small. Times are
-nanoseconds since the start of the recording. A name is only ever JSON here, text in HTML or text
-on a canvas, never markup or code.
+microseconds since the start of the recording, each less the one before it; durations are
+nanoseconds, with the digits that are shown of them. A name is only ever JSON here, text in HTML or
+text on a canvas, never markup or code.
 """
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterator, Mapping, Sequence
 import json
 from typing import Any, NamedTuple
+import zlib
 
 from mddag_executor.analysis.as_recorded import Replay
 from mddag_executor.analysis.usage import PoolUse
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import counts, SinkTally, VERDICTS
 from mddag_executor.recording.columns import Ints, Table
-from mddag_executor.recording.joins import rows_by
+from mddag_executor.recording.joins import distinct, rows_by
 from mddag_executor.report.columns import executions
 from mddag_executor.report.tables import missed_share, short_names
 from mddag_executor.report.text import format_ns, printable, shortened
@@ -116,8 +119,9 @@ def page_data(data: ReportData, misses: Ints) -> dict[str, Any]:
     workers = [printable(name) for name in data.worker_names] or [f'worker {w}' for w in range(n)]
     on = table['worker'].astype(np.int64)
     spare = (on < 0) | (on >= len(workers))
-    known = column['release_ns'].known
-    release = column['release_ns'].values[order]
+    recorded = data.replay.recording.jobs
+    places = recorded.places(table)
+    jobs = distinct(places[(places >= 0) & (table['vertex'] >= 0)])
     waited = np.where(spare & (table['ready'] < 0), 0, table['start'] - table['ready'])
     response = verdicts['completed'] - verdicts['release']
     deadlines = data.replay.judged.tables.sink_deadline
@@ -129,18 +133,18 @@ def page_data(data: ReportData, misses: Ints) -> dict[str, Any]:
         'deadlines': [int(deadlines[i]) for i in range(len(declared))],
         'workers': workers + ['spare threads'] * bool(spare.any()),
         'lines': lines, 'lineOf': line_of, 'kinds': [VERDICTS[kind] for kind in sorted(VERDICTS)],
+        'jobs': {
+            'dag': (np.searchsorted(recorded.first, jobs, 'right') - 1).tolist(),
+            'job': _steps(recorded.number[jobs]),
+            'release': _steps(_us(_since(data, recorded.release[jobs])))},
         'executions': {
-            'start': np.diff(start, prepend=0).tolist(),
-            'ran': (table['end'] - table['start']).tolist(), 'waited': waited.tolist(),
-            'worker': np.where(spare, len(workers), on).tolist(),
+            'start': _steps(_us(start)), 'ran': _shown(table['end'] - table['start']),
+            'waited': _shown(waited), 'worker': np.where(spare, len(workers), on).tolist(),
             'name': column['vertex'].values[order].tolist(), 'job': table['job'].tolist(),
-            'released': [before if there else None for before, there in zip(
-                (table['start'] - release).tolist(),
-                np.ones(len(release), bool) if known is None else known[order])],
-            'verdict': leads_to.tolist(), 'colour': colour.tolist()},
+            'sink': np.append(verdicts['sink'], -1)[leads_to].tolist(), 'colour': colour.tolist()},
         'verdicts': {
             'sink': verdicts['sink'].tolist(), 'job': verdicts['job'].tolist(),
-            'release': _since(data, verdicts['release']).tolist(),
+            'release': _steps(_us(_since(data, verdicts['release']))),
             'response': [None if never else took for never, took in zip(
                 (verdicts['completed'] < 0).tolist(), response.tolist())],
             'kind': verdicts['kind'].tolist()},
@@ -154,6 +158,25 @@ def page_data(data: ReportData, misses: Ints) -> dict[str, Any]:
 def _since(data: ReportData, times: Any) -> Any:
     """Return times of the recording since its start, ns."""
     return times - (data.replay.recording.start or 0)
+
+
+def _us(times: Ints) -> Ints:
+    """Return times in us, the unit in which they are shown."""
+    return np.rint(times / 1000).astype(np.int64)
+
+
+def _steps(values: Ints) -> list[int]:
+    """Return the first value, and what each other one adds to the one before: small numbers."""
+    steps: list[int] = np.diff(values, prepend=0).tolist()
+    return steps
+
+
+def _shown(durations: Ints) -> list[int]:
+    """Return durations, ns, rounded to the four digits that are shown, or to 1 us."""
+    digits = np.floor(np.log10(np.maximum(1, np.abs(durations)))).astype(np.int64)
+    unit = 10 ** np.clip(digits - 3, 0, 3)
+    rounded: list[int] = ((durations + unit // 2) // unit * unit).tolist()
+    return rounded
 
 
 def _over_time(data: ReportData, use: PoolUse) -> dict[str, Any]:
@@ -201,10 +224,15 @@ def _ancestors(dag: Dag, sink: int) -> list[int]:
     return found
 
 
-def json_for_html(value: Any) -> str:
-    """Return JSON that can be in a script element with any contents."""
+def packed(value: Any) -> str:
+    """Return a value as JSON, deflated, in base64: the page's script unpacks it."""
     text = json.dumps(value, ensure_ascii=True, separators=(',', ':'), allow_nan=False)
-    return text.replace('<', '\\u003c').replace('>', '\\u003e').replace('&', '\\u0026')
+    return base64.b64encode(zlib.compress(text.encode('ascii'))).decode('ascii')
+
+
+def unpacked(text: str) -> Any:
+    """Return what ``packed`` was given."""
+    return json.loads(zlib.decompress(base64.b64decode(text)))
 
 
 def label(text: str, longest: int = LONGEST_LABEL) -> str:

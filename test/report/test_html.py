@@ -4,7 +4,6 @@
 
 from html.parser import HTMLParser
 import io
-import json
 from pathlib import Path
 import re
 
@@ -19,11 +18,12 @@ from mddag_executor.report.diff import callbacks_table, compare, sinks_table
 from mddag_executor.report.html_data import (
     COLOURS,
     histogram,
-    json_for_html,
     label,
     MOST_MISSES,
+    packed,
     page_data,
     shown_misses,
+    unpacked,
 )
 from mddag_executor.report.html_tables import html_table, sinks_html
 from mddag_executor.report.perfetto import write_perfetto
@@ -66,7 +66,7 @@ def drawn(data):
 def test_what_is_in_the_file_is_what_ran(tmp_path):
     found = drawn(html.of_outcome(replay(runs.by_hand(tmp_path / 'run.mcap'))))
     bars = found['executions']
-    start = np.cumsum(bars['start'])
+    start = np.cumsum(bars['start']) * 1000
     assert (start / runs.MS).tolist() == [0, 2, 10, 13, 20, 27, 31]
     assert ((start + bars['ran']) / runs.MS).tolist() == [1, 5, 12, 16, 26, 30, 33]
     missed, more, unknown = map(COLOURS.index, ('missed', 'more', 'unknown'))
@@ -75,7 +75,12 @@ def test_what_is_in_the_file_is_what_ran(tmp_path):
         *['worker 0', 'worker 1'] * 3, 'spare threads']
     assert [found['lines'][found['lineOf'][each]].label for each in bars['name']] == [
         *['driver:tick', 'filter:run'] * 3, 'extra']
+    assert [found['declared'] - 1 if each < 0 else each for each in bars['sink']] == [1] * 7
+    jobs = found['jobs']
+    assert np.cumsum(jobs['job']).tolist() == [0, 1, 2] and jobs['dag'] == [0] * 3
+    assert (np.cumsum(jobs['release']) * 1000 / runs.MS).tolist() == [0, 10, 20]
     verdicts, (place,) = found['verdicts'], found['misses']
+    verdicts['release'] = (np.cumsum(verdicts['release']) * 1000).tolist()
     assert {name: column[place] for name, column in verdicts.items()} == {
         'sink': 1, 'job': 2, 'release': 20 * runs.MS, 'response': 10 * runs.MS,
         'kind': found['kinds'].index('late')}
@@ -212,9 +217,9 @@ def test_a_page_needs_nothing_but_itself_and_hostile_names_stay_text(tmp_path):
 
 @given(st.text())
 def test_json_and_cells_hold_any_text(text):
-    encoded = json_for_html({'x': text})
-    assert json.loads(encoded) == {'x': text}
-    assert not re.search('[<>&]', encoded)
+    encoded = packed({'x': text})
+    assert unpacked(encoded) == {'x': text}
+    assert re.fullmatch('[A-Za-z0-9+/=]+', encoded)
     page = Page(html_table(('a',), [(text,)], 1))
     assert [tag for tag, _ in page.elements] == ['table', 'thead', 'tr', 'th', 'tbody', 'tr', 'td']
     assert len(label(text, 20)) <= 20
