@@ -10,8 +10,8 @@ Theory of operation:
 2. The fields are gathered later, a kind at a time, as columns (`ctf_layout`).  Events with
    variants, or with arrays of structures, are read one by one.
 3. A time in an event has only its last bits; it is the first such time after the one before it.
-4. What comes from the file is checked before it is used.  Of a packet in which an event cannot be
-   read, the events before it are used.
+4. Sizes and offsets in the file are checked before they are used.  Of a packet in which an event
+   cannot be read, the events before it are used.
 """
 
 from __future__ import annotations
