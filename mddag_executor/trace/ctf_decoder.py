@@ -136,7 +136,7 @@ class _Chain:
         self.kind, self.form = kind, form
         self.head, self.payload = head, payload
         self.stamp: Path = form.stamp and ('head', *form.stamp)
-        # by field of unknown size, by place of what is before it: the bytes before it; of an array
+        # by field of unknown size, by place of the run before it: the bytes before it; of an array
         # where its number of elements is, and what reads it; the size of an element
         self._tails: list[tuple[list[int], list[Unpacker], int]] = []
         sizes = [0] * 8

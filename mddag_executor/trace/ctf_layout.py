@@ -4,7 +4,7 @@
 Where the fields of CTF events are: two ways to read them.
 
 1. *Runs.*  The fields of an event are runs of fields of known sizes, and texts and sequences
-   between them.  A run has a layout: the place of each field.  So many events become columns at
+   between them.  A run has a layout: the place of each field.  Many events become columns at
    once, when it is known where each run begins.  Alignment is relative to the packet, so there is
    a layout for each place of a run within 8 bytes.  Nearly every event at run time is one run.
 2. *Readers.*  Anything else (variants, arrays of structures) is read event by event.  Whatever a

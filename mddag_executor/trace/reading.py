@@ -129,7 +129,7 @@ class Reading:
     ) -> None:
         self.chunks = 0             # used
         self.messages = 0           # in used chunks, of all channels
-        self._packed = 0            # bytes of what is used, packed
+        self._packed = 0            # bytes of the used chunks, packed
         self.damage: Damage | None = None
         self._path, self._channels = path, channels
         self._blocks = blocks(stream, start, size)

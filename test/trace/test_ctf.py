@@ -122,7 +122,7 @@ def _sequence(rng, at, bits):
 @pytest.mark.parametrize('context', [True, False])
 @pytest.mark.parametrize('seed', range(30))
 def test_columns_are_what_is_read_event_by_event(context, seed, tmp_path, monkeypatch):
-    """Texts and sequences in any order, in contexts and fields, at all places; also if cut."""
+    """Texts and sequences in any order, in contexts and fields, at all places, and cut at some."""
     rng = random.Random(seed)
     layouts = [[rng.choice(['byte', 'word', 'long', 'text', 'bytes', 'longs'])
                 for _ in range(rng.randrange(5))] for _ in range(3)]
