@@ -21,8 +21,8 @@ GOES_ON = -2
 
 DISCARDED, MISSING, DAMAGED = 1, 2, 3
 """
-Why events of an imported recording are lost: the tracer discarded them; packets are not in its files;
-or places in its files are damaged.  The event says how many events, packets or places.
+Why events of an imported recording are lost: the tracer discarded them; packets are not in
+its files; or places in its files are damaged.  The event says how many events, packets or places.
 """
 
 PREAMBLE = (('timestamp', 'int64'), ('vpid', 'int32'), ('vtid', 'int32'))
