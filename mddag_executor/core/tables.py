@@ -31,7 +31,6 @@ least difference of these sinks' deadlines and the longest paths to them (least 
 (``reach_sink``), from ``first_reach`` of the vertex on.  ``mean_time`` is the declared mean
 execution time, ``height`` the number of edges on the longest path to a sink.
 * ``importance``: the highest of the sinks that it leads to, over trigger and queue edges.
-* ``tolerated``, ``tolerated_of``: the m and k of a sink with ``tolerate: m of k``, else 0.
 
 ``is_optional``, next to ``successors``: 1 if the edge becomes true only in some jobs, because its
 topic is one that the vertex may publish.  ``gates``, from ``first_gate`` of a sink on: the
@@ -131,8 +130,6 @@ class Tables(NamedTuple):
     mean_time: list[int]
     height: list[int]
     importance: list[int]
-    tolerated: list[int]
-    tolerated_of: list[int]
     sink_deadline: list[int]
     judged: list[int]
     entity: list[int]
@@ -239,9 +236,6 @@ class _Columns:
             lists['first_reach'].append(len(lists['reach_sink']))
             lists['mean_time'].append(mean_time(vertex))
             lists['height'].append(heights[vertex.index])
-            tolerate = vertex.callback.tolerate
-            lists['tolerated'].append(0 if tolerate is None else tolerate.misses)
-            lists['tolerated_of'].append(0 if tolerate is None else tolerate.of)
             lists['keep'].append(
                 KEEP_NEWEST if vertex.callback.keep == 'newest'
                 else KEEP_TIMELY if vertex.callback.kind == 'timer' else KEEP_ALL)
@@ -310,8 +304,7 @@ class _Columns:
             'dag_of': n_dags, 'index_in_dag': 0, 'rad_offset': default_deadline,
             'latest_start': default_deadline, 'first_reach': len(lists['reach_sink']),
             'keep': KEEP_ALL, 'mean_time': 0, 'height': 0,
-            'importance': IMPORTANT, 'tolerated': 0, 'tolerated_of': 0,
-            'sink_deadline': -1, 'judged': 0,
+            'importance': IMPORTANT, 'sink_deadline': -1, 'judged': 0,
             'entity': len(self._entities), 'region_offset': 0,
             'n_legs': 1, 'first_leg': self._n_queues,
             'n_predecessors': 0, 'first_successor': len(lists['successors']),

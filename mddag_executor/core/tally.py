@@ -342,7 +342,8 @@ class Tally:
 
     def tolerated(self, vertex: int) -> int:
         """Return how many misses a sink with a window tolerates in it."""
-        return self._tables.tolerated[vertex]
+        tolerate = self._tolerate(vertex)
+        return 0 if tolerate is None else tolerate.misses
 
     def _tolerate(self, vertex: int) -> WeaklyHard | None:
         return self._vertex(vertex).callback.tolerate if self._dags else None
