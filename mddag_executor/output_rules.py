@@ -58,7 +58,7 @@ def check_output(path: str | None, is_kept: bool = False, overwrite: bool = Fals
     """
     if path is None or path == '-':
         return
-    if os.path.isdir(path):
+    if os.path.isdir(path) or path.endswith('/'):
         raise InputError(path, 'this is a directory', 'name a file')
     if not is_special(path):
         check_parent(path)

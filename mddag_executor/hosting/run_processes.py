@@ -33,7 +33,12 @@ from mddag_executor.hosting.run_options import RunOptions, spec_of
 from mddag_executor.hosting.run_result import RunResult
 from mddag_executor.hosting.signals import Signals
 from mddag_executor.laboratory.placement import packed
-from mddag_executor.output_rules import check_output, remove_recording, version_of
+from mddag_executor.output_rules import (
+    check_output,
+    check_parent,
+    remove_recording,
+    version_of,
+)
 from mddag_executor.shared_memory import segments_removed
 from mddag_executor.simulate.execution_times import draw_execution_times
 from mddag_executor.synthetic.measure import ExecutionPlan
@@ -66,6 +71,7 @@ def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> R
         names = [process.name for process in task_set.processes]
         _warn_of_contested(task_set, warn)
         _warn_of_divided_paths(task_set, warn)
+        new_folder = _make_folder(options.trace)
         for name in names:
             check_output(_trace(options.trace, name), is_kept=True, overwrite=options.overwrite)
         if plan is not None:
@@ -93,6 +99,9 @@ def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> R
                 for trace, version in zip(traces, earlier):
                     remove_recording(trace, version)
             raise
+        finally:
+            if new_folder is not None and not os.listdir(new_folder):
+                os.rmdir(new_folder)
         parts = [read_result(folder, run.process.pid) for run in supervisor.runs]
         has_started = signals.ended_by is None or all(
             part is not None and part['has_started'] for part in parts)
@@ -218,6 +227,16 @@ def _command(
     return [sys.executable, '-m', 'mddag_executor', 'run', options.graph_name, '--part', folder,
             *(() if not is_quiet else ('--quiet',)),
             *(nodes if options.synthetic is None else ('--synthetic', options.synthetic))]
+
+
+def _make_folder(given: str | os.PathLike[str] | None) -> str | None:
+    """Make the folder for the traces that `FOLDER/` names; return it if it is new."""
+    folder = '' if given is None else os.fspath(given)
+    if not folder.endswith('/') or os.path.isdir(folder):
+        return None
+    check_parent(folder.rstrip('/'))
+    os.mkdir(folder.rstrip('/'))
+    return folder
 
 
 def _trace(given: str | os.PathLike[str] | None, name: str) -> str | None:

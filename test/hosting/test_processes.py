@@ -148,7 +148,7 @@ def test_programs_run_in_the_process_of_their_nodes(world):
         ',\n                 release_from: header_stamp', ''))
     nodes = ['--node', 'up=relay:sensor', *NODES[2:4], '--node', 'down=slow:second', '--node',
              'down=slow:last']
-    with running('graph.yaml', *nodes, '--trace', '.') as run:
+    with running('graph.yaml', *nodes, '--trace', 'run/') as run:
         wait_for_run(run, (world / 'enough').exists)
         run.send_signal(signal.SIGINT)
         result, _, errors = end(run)
@@ -158,16 +158,16 @@ def test_programs_run_in_the_process_of_their_nodes(world):
     assert result['callbacks']['/sensor:tick']['ran'] >= 60
     assert result['never_ran'] == [] and not any(p['died'] for p in result['processes'])
     for name in ('up', 'down'):
-        assert {e['dag'] for e in read_events(f'{name}.mcap', {'mddag:complete'})} == {0}
+        assert {e['dag'] for e in read_events(f'run/{name}.mcap', {'mddag:complete'})} == {0}
     live, replayed = (counts(dags['chain']['sinks']['/last:sink']) for dags in (
-        result['dags'], replay(['up.mcap', 'down.mcap']).result()['dags']))
+        result['dags'], replay(['run/up.mcap', 'run/down.mcap']).result()['dags']))
     # on a busy machine also those whose message waited 0.1 s for its announcement, or did not run
     lost = sum(each[how] for each in result['callbacks'].values()
                for how in ('dropped', 'skipped', 'lost'))
     assert 0 <= replayed.due - live.due <= result['undeclared'] + lost
     assert live.due > 0
     # all traces together make a declaration, with the processes and the measured times
-    draft = System(Traces(['up.mcap', 'down.mcap'])).draft()
+    draft = System(Traces(['run/up.mcap', 'run/down.mcap'])).draft()
     accept(draft)
     drafted = declaration_of(draft, True)
     assert {p.name: {'/sensor', '/first', '/second', '/last'} & set(p.nodes)
@@ -256,6 +256,9 @@ def test_a_run_that_cannot_begin_leaves_no_trace(world, mddag):
                  '--trace', 'out.mcap', '--overwrite')
     assert (done.returncode, done.stderr.count('error: ')) == (2, 1), done.stderr
     assert not list(world.glob('*.mcap'))
+    mddag('run', 'graph.yaml', '--node', 'up=bad:missing', '--node', 'down=bad:missing',
+          '--trace', 'new/')
+    assert not (world / 'new').exists()
     (world / 'out.up.mcap').write_text('earlier')
     mddag('run', 'graph.yaml', '--node', 'up=bad:missing', '--node', 'down=bad:missing',
           '--trace', 'out.mcap', '--overwrite')

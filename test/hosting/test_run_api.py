@@ -157,6 +157,7 @@ def test_a_program_that_the_end_of_the_time_interrupts_has_not_failed(here):
     ({'nodes': [Api], 'policy': 'best'}, 'best'),
     ({'nodes': [Api], 'workers': 0}, 'workers=0: give an integer from 1 up'),
     ({'nodes': [Api], 'trace': 'nowhere/x.mcap'}, 'there is no directory nowhere'),
+    ({'nodes': [Api], 'trace': 'new/'}, 'new/: this is a directory: name a file'),
     ({'nodes': [Api], 'graph': 'graph.yaml', 'processes': 2},
      'several processes need its name: give '),
     ({'nodes': [4]}, 'makes no node'),
