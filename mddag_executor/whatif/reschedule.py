@@ -283,7 +283,7 @@ def reschedule(
         warnings.append(
             f'{run.name}: {counted(left_out, "run")} of undeclared callbacks in processes of '
             'declared ones take no time: declare them, as mddag graph from-trace does')
-    if cpus is not None and run.run.declared and len(work.load.computed) == 0:
+    if cpus is not None and run.run.declared and work.executions and not len(work.load.computed):
         warnings.append(
             f'{run.name}: CPU times are not recorded in it, so with --cpus each '
             'execution computes all the time')
