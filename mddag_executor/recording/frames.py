@@ -68,7 +68,10 @@ def arrow_of(recording: str, arrays: Mapping[str, tuple[Any, str]]) -> Any:
     fields = [pyarrow.field(name, array.type, metadata={'unit': unit} if unit else None)
               for name, (array, unit) in arrays.items()]
     return pyarrow.table([array for array, _ in arrays.values()], schema=pyarrow.schema(
-        fields, metadata={'mddag.tables': VERSION, 'mddag.recording': recording}))
+        fields, metadata={
+            'mddag.tables': VERSION,
+            # the name of a file need not be UTF-8
+            'mddag.recording': recording.encode('utf-8', 'backslashreplace')}))
 
 
 def _names(words: Words, table: str, column: str, values: Any) -> Any:

@@ -4,6 +4,7 @@
 
 import os
 from pathlib import Path
+import shutil
 
 from mddag_executor import open_recording, replay
 from mddag_executor.analysis.result_table import result_tables
@@ -31,6 +32,15 @@ def test_the_tables_of_a_recording(tmp_path, call):
     keys = {vertex.name: vertex.callback.key for vertex in recording.task_set.vertices}
     assert {(row['vertex'], row['callback']) for row in executions.to_pylist()
             if row['vertex']} <= keys.items()
+
+
+def test_the_name_of_a_recording_need_not_be_utf_8(tmp_path, call):
+    path = os.fsdecode(os.fsencode(tmp_path) + b'/drive \xff.mcap')
+    shutil.copy(DEMO, path)
+    for out in ('a.pftrace', 'a.csv', 'a.parquet', 'a/'):
+        assert call('export', path, '-o', f'{tmp_path}/{out}').returncode == 0
+    assert parquet.read_schema(tmp_path / 'a' / 'releases.parquet').metadata[
+        b'mddag.recording'].endswith(b'/drive \\udcff.mcap')
 
 
 def test_a_folder_replaces_an_earlier_export_only(tmp_path, call):
