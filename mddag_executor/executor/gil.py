@@ -26,16 +26,16 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     ``GilCheck`` checks its thread while others wait for the GIL, first after ``CHECK_NS``, or less
     if what waits is urgent, and then at growing intervals.  If the thread waits, the execution
     gives the GIL up.
-5.  *Waiting, not starving.*  A thread that has not computed since the last check may have waited
-    for an event, for the GIL, or for a CPU.  It waited for an event if it got no CPU for
+5.  *Waiting, not starving.* A thread that has not computed since the last check may have waited
+    for an event, for the GIL, or for a CPU. It waited for an event if it got no CPU for
     ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
-    ``SWITCH_INTERVAL_S``.  It also did if, for a quarter of the time, it was not ready to run and
-    no other thread computed, unless the CPUs are busy with other programs: then the thread that
-    has the GIL may not have computed because it waited for a CPU (``BUSY``).  The threads that
-    check compute as well, for as long as the shortest interval.  If the thread got no CPU
-    meanwhile, they do not count: it would have got the GIL between two checks, when they gave that
-    away.  Anything else is unclear, and counts only after ``LATELY`` checks, so that the GIL is
-    not withheld from others for ever.
+    ``SWITCH_INTERVAL_S``; later if the CPUs are busy (``LONG_SLEEP_NS``). It also did if, for a
+    quarter of the time, it was not ready to run and no other thread computed, unless the CPUs are
+    busy with other programs: then the thread that has the GIL may not have computed because it
+    waited for a CPU (``BUSY``). The threads that check compute as well, for as long as the
+    shortest interval. If the thread got no CPU meanwhile, they do not count: it would have got the
+    GIL between two checks, when they gave that away. Anything else is unclear, and counts only
+    after ``LATELY`` checks, so that the GIL is not withheld from others for ever.
 """
 
 from __future__ import annotations
@@ -87,7 +87,21 @@ it, the successor of a callback that waits after its publication started 0.1 ms 
 """
 
 BUSY = 10
-"""The CPUs are busy if a thread that is checked was ready for a tenth of the time without one."""
+"""
+The CPUs are busy if a thread that is checked was ready for a tenth of the time without one.
+
+That is the time since the first check of its execution: between two checks, a thread that waits
+for the GIL may have been asleep all the time.
+"""
+
+LATE_CHECK_NS = 2 * CHECK_NS
+"""A check that comes later than planned by this much shows that the CPUs are busy."""
+LONG_SLEEP_NS = 5 * CHECK_NS
+"""
+How long a thread that waits for an event is asleep, if the CPUs are busy; else ``CHECK_NS``.
+
+At a load of 20 on two virtual CPUs, threads that waited for the GIL woke up to 2.3 ms late.
+"""
 
 SWITCH_INTERVAL_S = 0.001
 """
@@ -328,12 +342,14 @@ class GilCheck:
     :ivar subject: the execution to check.
     """
 
-    __slots__ = ('at', 'subject', '_step', '_first', '_last', '_unclear')
+    __slots__ = ('at', 'subject', '_step', '_first', '_last', '_unclear', '_observed', '_delayed')
 
     def __init__(self) -> None:
         self.at = NEVER
         self.subject: object = None
         self._step = self._first = 0
+        # for how long it has been observed, and was ready to run without a CPU meanwhile
+        self._observed = self._delayed = 0
         self._last: _Reading | None = None
         self._unclear = 0
 
@@ -343,6 +359,8 @@ class GilCheck:
 
         :param after: time until the first check, ns; ``step``: from that to the second one.
         """
+        if self.subject is not subject:
+            self._observed = self._delayed = 0
         if self.subject is not subject or after < self._step:
             self._first = step
             self.subject = subject
@@ -374,7 +392,7 @@ class GilCheck:
         :param resting: the CPU times of the threads that only check and wait, ns; the key of each
             changes when it has run anything else.
         """
-        last = self._last
+        last, late = self._last, now - self.at
         new = self._last = _Reading(
             now, cpu_ns(ident), process_time_ns(), schedule_of(tid), resting)
         self._step = self._first if last is None else min(2 * self._step, LAST_CHECK_NS)
@@ -382,15 +400,20 @@ class GilCheck:
         if last is None:
             return False
         passed, own = now - last.at, new.own - last.own
+        delayed = new.schedule.delay_ns - last.schedule.delay_ns
+        self._observed += passed
+        is_late = late >= LATE_CHECK_NS
+        self._delayed += delayed + late * is_late
         if 20 * own >= passed:  # it computes for at least 5 % of the time
             self._unclear = 0
             return False
         if is_asleep(tid):
-            if passed >= CHECK_NS and new.schedule.slices == last.schedule.slices >= 0:
+            is_busy = BUSY * self._delayed >= self._observed
+            if passed >= (LONG_SLEEP_NS if is_busy else CHECK_NS) and not is_late and (
+                    new.schedule.slices == last.schedule.slices >= 0):
                 return True
             others = new.others_since(last)
-            delayed = new.schedule.delay_ns - last.schedule.delay_ns
-            if BUSY * delayed < passed and 4 * (passed - others - delayed) >= passed:
+            if not is_busy and 4 * (passed - others - delayed) >= passed:
                 return True
         self._unclear += 1
         return self._unclear >= LATELY

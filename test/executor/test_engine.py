@@ -634,7 +634,7 @@ def test_on_a_busy_machine_a_thread_that_waits_for_the_gil_does_not_count_as_wai
     monkeypatch.setattr(gil, 'cpu_ns', lambda ident: 0)
     monkeypatch.setattr(gil, 'process_time_ns', lambda: 0)
     check = GilCheck()
-    check.begin(check, 0, 0, MS)
+    check.begin(check, 0, 0, 20 * MS)
     assert not check.waits(0, 0, 0)
     assert check.waits(0, 0, 20 * MS) == waits
 

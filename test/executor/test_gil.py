@@ -69,6 +69,33 @@ def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, h
     assert [*intervals] == [pytest.approx(0.001)] and sys.getswitchinterval() == before
 
 
+@pytest.mark.parametrize('delay_ms, waits', [(0, True), (8, False)], ids=['idle', 'busy'])
+def test_a_thread_that_sleeps_waits_unless_the_cpus_are_busy(monkeypatch, delay_ms, waits):
+    """On a busy machine it may be the thread that has the GIL that gets no CPU."""
+    own, schedules = iter([0, MS, MS]), iter([
+        gil.Schedule(0, 10), gil.Schedule(delay_ms * MS, 14), gil.Schedule(delay_ms * MS, 14)])
+    used = iter([0, MS, MS])
+    monkeypatch.setattr(gil, 'is_asleep', lambda tid: True)
+    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: next(own))
+    monkeypatch.setattr(gil, 'process_time_ns', lambda: next(used))
+    monkeypatch.setattr(gil, 'schedule_of', lambda tid: next(schedules))
+    check = gil.GilCheck()
+    check.begin('execution', 0, 2 * MS, 10 * MS)
+    assert [check.waits(1, 1, at) for at in (2 * MS, 12 * MS, 15 * MS)] == [False, False, waits]
+
+
+@pytest.mark.parametrize('late_ms, waits', [(0, True), (6, False)])
+def test_a_thread_that_sleeps_waits_unless_the_check_is_late(monkeypatch, late_ms, waits):
+    """The machine may have stopped meanwhile."""
+    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: 0)
+    monkeypatch.setattr(gil, 'process_time_ns', lambda: 0)
+    monkeypatch.setattr(gil, 'schedule_of', lambda tid: gil.Schedule(0, 10))
+    monkeypatch.setattr(gil, 'is_asleep', lambda tid: True)
+    check = gil.GilCheck()
+    check.begin('execution', 0, 2 * MS, 3 * MS)
+    assert [check.waits(1, 1, at) for at in (2 * MS, (5 + late_ms) * MS)] == [False, waits]
+
+
 def test_what_is_learnt_of_callbacks(make_executor, make_node):
     """Who computes, and what each needs when nothing disturbs it."""
     node, bell, ran = make_node(), threading.Event(), []
