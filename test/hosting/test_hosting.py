@@ -85,7 +85,8 @@ GOES_ON = {
     'spins_once_for_ever': ['for_ever heard five'],
     'steps': ['30 steps'],
     'calls_a_service': ['answer: forty-two'],
-    'handles_its_exceptions': ['rclpy raised odd', 'executor raised odd'],
+    'handles_its_exceptions': [
+        'rclpy raised odd', 'executor raised odd', 'has handled its exceptions'],
     'spins_in_callbacks': [
         f'{way} forty-two' for way in (
             'of the node', 'of rclpy', 'step by step', 'step by step of rclpy')],

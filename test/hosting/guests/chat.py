@@ -256,6 +256,7 @@ def handles_its_exceptions():
             except ValueError as error:
                 print(f'{name} raised {error}')
     timer.cancel()
+    print('has handled its exceptions')
     spin_to_the_end(node)
 
 
