@@ -16,6 +16,7 @@ from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
 from mddag_executor.executor.session import Session
 from mddag_executor.hosting import processes
+from mddag_executor.shared_memory import segments_removed
 from mddag_executor.trace import read_events
 from msg_graph import loads
 from msg_graph.draft import accept, declaration_of
@@ -194,8 +195,10 @@ def test_an_end_while_processes_start_is_quiet(world):
 def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
     with running('graph.yaml', *NODES, '--on-exit', 'continue', '--trace', 'out.mcap') as run:
         wait_for_run(run, (world / 'enough').exists)
-        os.kill(pids(run)['up'], signal.SIGKILL)
-        wait_for_run(run, lambda: 'up' not in pids(run))
+        killed = pids(run)['up']
+        with segments_removed(killed):
+            os.kill(killed, signal.SIGKILL)
+            wait_for_run(run, lambda: 'up' not in pids(run))
         run.send_signal(signal.SIGTERM)
         result, out, errors = end(run)
     assert run.returncode == 70
