@@ -240,11 +240,6 @@ class TimerQueue:
             self.has_jumped = True
             self._on_change()
 
-    def clear(self) -> None:
-        """Forget all timers."""
-        for source in list(self._timers.values()):
-            self.remove(source)
-
     # --- due times -------------------------------------------------------------------------------
 
     def ask(self, source: TimerEntity) -> None:
