@@ -47,6 +47,7 @@ def broken_in_core(t: Tables, s: State) -> Iterator[str]:
     """Yield a sentence for each invariant of the core's state that does not hold."""
     yield from _heaps(s)
     yield from _queues(t, s)
+    yield from _inheriting(t, s)
     yield from _workers(s)
     yield from _groups(t, s)
     yield from _outer_groups(s)
@@ -103,14 +104,36 @@ def _queues(t: Tables, s: State) -> Iterator[str]:
             if s.x_state[x] != WAITING or s.x_queue[x] != queue or s.x_started[x] >= 0:
                 yield f'execution {x} in queue {queue} has state {s.x_state[x]}'
         found.update(waiting)
-        if waiting and s.queue_key[queue] > s.x_key[first] and s.queue_demoted[queue] < 0 and (
-                s.x_vertex[first] == t.n_vertices or s.start_by[s.x_vertex[first]] == NEVER):
+        if waiting and s.queue_demoted[queue] < 0 and s.queue_key[queue] > _last_place(t, s, first):
             yield f'queue {queue} is not late, and comes after its first execution'
         if not waiting and (s.queue_demoted[queue] >= 0 or s.queue_place[queue] != READY):
             yield f'queue {queue} is empty, and is late or set aside'
     if len(found) != s.x_state.count(WAITING):
         lost = [x for x, state in enumerate(s.x_state) if state == WAITING and x not in found]
         yield f'the waiting executions {lost} are in no queue'
+
+
+def _last_place(t: Tables, s: State, first: int) -> QueueEntry:
+    """Return the largest key of a queue that is not late, given its first execution."""
+    key = s.x_key[first]
+    if s.start_by[s.x_vertex[first]] == NEVER:
+        return key
+    if s.x_vertex[first] < t.n_vertices:
+        return (NEVER, *key[1:])
+    # less urgent than its key if what it has inherited is over
+    return (max(key[0], s.job_release[s.x_slot[first]] + t.rad_offset[t.n_vertices]), *key[1:])
+
+
+def _inheriting(t: Tables, s: State) -> Iterator[str]:
+    """Check that only undeclared executions inherit."""
+    for x, like in enumerate(s.x_like):
+        vertex = s.x_vertex[x]
+        if vertex < t.n_vertices:
+            if like != vertex:
+                yield f'execution {x} of vertex {vertex} is like {like}'
+            continue
+        if not -1 <= like < t.n_vertices:
+            yield f'execution {x} inherits from vertex {like}'
 
 
 def _workers(s: State) -> Iterator[str]:

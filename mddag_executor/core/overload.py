@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from heapq import heappop
 
+from mddag_executor.core.inheritance import undeclared_priority
 from mddag_executor.core.jobs import demotes, judge
 from mddag_executor.core.queues import change_key, come_forward
 from mddag_executor.core.state import (
@@ -49,7 +50,7 @@ def demote(t: Tables, s: State, heap: list[QueueEntry], x: int, now: int) -> boo
     """
     entry = heap[0]
     priority = NEVER
-    if entry[4] >= 0 or s.x_vertex[x] < t.n_vertices or s.x_started[x] < 0:
+    if entry[4] >= 0 or s.x_like[x] >= 0 or s.x_started[x] < 0:
         priority = _priority_in_time(t, s, x, now)
         if priority == NEVER:
             priority = _late_priority(t, s, x, now)
@@ -75,7 +76,7 @@ def _priority_in_time(t: Tables, s: State, x: int, now: int) -> int:
     """
     vertex = s.x_vertex[x]
     if vertex == t.n_vertices:
-        return NEVER  # it is not known how long they take
+        return undeclared_priority(t, s, x, now)
     process = s.process[vertex]
     yields = _still_gives_way(t, s, vertex, now)
     begin = now
@@ -149,7 +150,9 @@ def next_entry(t: Tables, s: State, queue: int, now: int) -> QueueEntry:
     if s.queue_demoted[queue] >= 0:
         s.queue_demoted[queue] = -1
         if s.x_vertex[after] == t.n_vertices:  # it remains late until it is empty
-            entry = (_late_priority(t, s, after, now), entry[1], entry[2], entry[3], queue)
+            late = _late_priority(t, s, after, now)
+            priority = min(late, undeclared_priority(t, s, after, now))
+            entry = (priority, entry[1], entry[2], entry[3], queue)
     return entry
 
 

@@ -305,12 +305,18 @@ def overtaking_pays(
     left = abs(usual - held)
     if left < TURN_NS or preempts:
         return left >= TURN_NS
-    return first < 0 or LONG_WAITS * left >= t.rad_offset[s.x_vertex[first]]
+    return first < 0 or LONG_WAITS * left >= _relative_deadline(t, s, first)
 
 
 def overtaking_pays_from(
     t: Tables, s: State, first: int, usual: int, preempts: bool
 ) -> int:
     """Return after which time of holding the interpreter overtaking pays again, ns."""
-    wait = 0 if first < 0 or preempts else -(-t.rad_offset[s.x_vertex[first]] // LONG_WAITS)
+    wait = 0 if first < 0 or preempts else -(-_relative_deadline(t, s, first) // LONG_WAITS)
     return usual + max(TURN_NS, wait)
+
+
+def _relative_deadline(t: Tables, s: State, x: int) -> int:
+    """Return RAD minus release of an execution, or of the one that it inherits from (rule 15)."""
+    like = s.x_like[x]
+    return t.rad_offset[like if like >= 0 else t.n_vertices]

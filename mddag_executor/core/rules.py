@@ -4,7 +4,8 @@
 The scheduling rules: all of them are listed here.
 
 Their code is here, in ``jobs`` (whole jobs), ``queues`` (order, groups, the interpreter),
-``overload`` (late queues), ``driven`` (syncs of two rates) and ``simulate.dispatch`` (preemption).
+``overload`` (late queues), ``driven`` (syncs of two rates), ``inheritance`` (requests) and
+``simulate.dispatch`` (preemption).
 
 Theory of operation
 -------------------
@@ -29,7 +30,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     reverse order of its edges; then releases, by DAG; then, during dispatch, preempted executions.
     An execution that goes on after it was preempted or has waited (*resumes*) waits alone.  It
     keeps the key of its job; the key of an undeclared one is counted from the time at which it
-    resumes.
+    resumes, but it goes on inheriting (rule 15).
 4.  **Callback groups.**  A group has at most one owner, from its first dispatch to its completion,
     including the time in which it is preempted or suspended.  If a queue comes first while the
     group of its first execution is busy, its entry is set aside in the heap of the group.  When
@@ -116,12 +117,19 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     the answered job: a vertex completes in them when it completes in a later job.  Executions
     without a job are ordered as if they belonged to the earliest job that they may complete in
     time (``due_of_answer``).
+15. **Requests.**  A request to a service or action that an execution of a job sends *inherits*: it
+    has the priority with which that execution was dispatched, if this is smaller than its own.  So
+    do the requests that it sends itself, its task if it is a goal, and the callbacks of the
+    response.  Requests of a callback keep their order, so those before it inherit as well.  If the
+    priority is over (a time in the past), they are ordered like any other undeclared execution.
+    Only with policies whose keys are times; a declared service keeps its own deadline.
 """
 
 from __future__ import annotations
 
 from heapq import heappop, heappush
 
+from mddag_executor.core.inheritance import inherit
 from mddag_executor.core.jobs import (
     close_job,
     deactivate,
@@ -255,7 +263,7 @@ def ready_undeclared(
     s.x_queue[x] = queue
     slot = s.x_slot[x]
     s.job_release[slot] = now
-    s.job_demoted[slot] = -1
+    s.x_like[x] = s.job_demoted[slot] = -1
     order = s.scalars[ORDER] = s.scalars[ORDER] + 1
     s.x_key[x] = key(t, t.n_vertices, now, job, order) + (queue,)
     if queue >= 0:
@@ -474,12 +482,18 @@ def resume(
 
     :param job: its index, for the key of an undeclared one; ``holds``: see ``State.x_holds``.
     """
+    like = -1
+    priority = s.x_key[x][0]
     if s.x_vertex[x] == t.n_vertices:
         order = s.scalars[ORDER] = s.scalars[ORDER] + 1
         s.x_key[x] = key(t, t.n_vertices, now, job, order) + (~x,)
         s.job_release[s.x_slot[x]] = now
+        like = s.x_like[x]
+        s.x_like[x] = -1
     s.x_holds[x] = holds
     wait_alone(s, x)
+    if like >= 0:
+        inherit(t, s, x, priority, like)
 
 
 def rejoin(

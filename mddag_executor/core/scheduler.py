@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from heapq import heappush
 
-from mddag_executor.core import jobs, rules
+from mddag_executor.core import inheritance, jobs, rules
 from mddag_executor.core.policies import policy
 from mddag_executor.core.queues import call_next, change_key, open_outer, remove
 from mddag_executor.core.state import (
@@ -47,6 +47,8 @@ class Scheduler:
     :ivar ready: ``ready(x, now)`` makes an execution ready.
     :ivar ready_undeclared: ``ready_undeclared(job, group, holds, queue, now)`` makes an
         undeclared callback ready, and returns its execution.
+    :ivar inherit: ``inherit(x, priority, like)`` lets a waiting undeclared execution inherit (rule
+        15), which ``heritage(x)`` of the sending one returns.
     :ivar take: ``take(worker, now)`` dispatches the next execution on an idle worker and returns
         it; -1: there is none to run.
     :ivar complete: ``complete(x, now)`` ends a running execution; it returns False for a leg that
@@ -76,6 +78,9 @@ class Scheduler:
             rules.make_ready, *rule, self.policy.key)
         self.ready_undeclared: Callable[[int, int, int, int, int], int] = partial(
             rules.ready_undeclared, *rule, self.policy.key)
+        self.inherit: Callable[[int, int, int], None] = partial(inheritance.inherit, *rule)
+        self.heritage: Callable[[int], tuple[int, int] | None] = partial(
+            inheritance.heritage, self.state)
         self.take: Callable[[int, int], int] = partial(rules.take, *rule)
         self.complete: Callable[[int, int], bool] = partial(
             rules.complete, *rule, self.policy.key)

@@ -129,12 +129,20 @@ class State(NamedTuple):
     job_late: list[int]
     # the release that counts for its order since it was demoted, or -1
     job_demoted: list[int]
+    # of an undeclared execution with the priority of another one (see ``inheritance``): when it
+    # became ready, what it inherits itself, and from which vertex
+    job_ready: list[int]
+    job_inherited: list[int]
+    job_heir: list[int]
     job_active: list[int]
     job_next: list[int]
     job_previous: list[int]
     # by execution
     x_slot: list[int]
     x_vertex: list[int]
+    # the vertex whose relative deadline it has: its own or, if it is undeclared, the one that its
+    # priority is inherited from; -1: it has the default one
+    x_like: list[int]
     x_state: list[int]
     x_pending: list[int]
     x_group: list[int]
@@ -240,6 +248,9 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
     s.job_sinks_left.append(0)
     s.job_late.append(0)
     s.job_demoted.append(-1)
+    s.job_ready.append(0)
+    s.job_inherited.append(NEVER)
+    s.job_heir.append(-1)
     s.job_active.append(0)
     s.job_next.append(-1)
     s.job_previous.append(-1)
@@ -254,6 +265,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
         for leg in range(t.n_legs[vertex]):
             s.x_slot.append(slot)
             s.x_vertex.append(vertex)
+            s.x_like.append(vertex if dag < t.n_dags else -1)
             s.x_group.append(t.group[vertex])
             s.x_outer.append(-1)
             s.x_place.append(0)

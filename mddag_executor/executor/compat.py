@@ -165,14 +165,35 @@ def ends_sleep(callback: Any) -> bool:
 
 # --- futures -------------------------------------------------------------------------------------
 
-def complete_request(client: Any, number: int, response: Any, executor: Any) -> None:
-    """Complete the future of a client's request; its callbacks run in an executor."""
+HERITAGE = '_mddag_heritage'
+"""The attribute of a future with what its callbacks inherit: see ``sent_requests``."""
+
+
+def complete_request(
+    client: Any, number: int, response: Any, executor: Any,
+    heritage: tuple[int, int] | None = None,
+) -> None:
+    """
+    Complete the future of a client's request; its callbacks run in an executor.
+
+    :param heritage: what they inherit; None: nothing.
+    """
     try:
         future = client.get_pending_request(number)
     except KeyError:
         return  # the request was cancelled
     future._set_executor(executor)
+    if heritage is not None:
+        setattr(future, HERITAGE, heritage)
     future.set_result(response)
+
+
+def heritage_of_response(args: tuple[Any, ...]) -> tuple[int, int] | None:
+    """Return what a task inherits that is a done callback of a request's future; None: nothing."""
+    found: tuple[int, int] | None = None
+    if args and isinstance(args[0], Future):
+        found = getattr(args[0], HERITAGE, None)
+    return found
 
 
 def attach_futures(waitable: Any, executor: Any) -> None:
@@ -274,13 +295,42 @@ GUARD_HANDLE: Any = _rclpy.GuardCondition
 """The class of a guard condition's handle: its method ``trigger_guard_condition`` triggers it."""
 
 
-# --- requests without a middleware (reruns) ------------------------------------------------------
+# --- requests ------------------------------------------------------------------------------------
 
+SERVICE_CLIENT_HANDLE: Any = _rclpy.Client
+"""The class of a client's handle: its method ``send_request`` sends requests."""
 CLIENT_HANDLE: Any = _rclpy.ActionClient
 """The class of an action client's handle: its methods send requests."""
 SERVER_HANDLE: Any = _rclpy.ActionServer
 """That of an action server's: its methods send responses, feedback and status."""
+ACTION_REQUESTS = ('goal', 'cancel', 'result')
+"""The kinds of requests to an action."""
 
+
+def goal_of(request: Any) -> bytes:
+    """Return the id of the goal that a request to an action is about."""
+    return bytes(getattr(request, 'goal_info', request).goal_id.uuid)
+
+
+def exchanged(waitable: Any, data: Any) -> list[tuple[Any, ...]]:
+    """
+    Return which requests an action server has taken, or which responses an action client.
+
+    They are in the data that the waitable has taken.  A request is given by its kind and goal, a
+    response by the client's handle, the kind and the number of the request.
+    """
+    if type(data) is not dict:
+        return []
+    kinds = [kind for kind in ACTION_REQUESTS if kind in data]
+    client = getattr(waitable, '_client_handle', None)
+    if type(client) is CLIENT_HANDLE:
+        return [(client, kind, data[kind][0]) for kind in kinds]
+    if type(getattr(waitable, '_handle', None)) is SERVER_HANDLE:
+        return [(kind, goal_of(data[kind][1])) for kind in kinds]
+    return []
+
+
+# --- requests without a middleware (reruns) ------------------------------------------------------
 
 def new_request(client: Any, number: int) -> Future:
     """Return the future of a request with a number, as ``Client.call_async`` makes it."""

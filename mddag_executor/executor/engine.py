@@ -65,6 +65,7 @@ from mddag_executor.executor.other_processes import OtherProcesses
 from mddag_executor.executor.outer_places import OuterPlaces
 from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.run_records import RunRecords
+from mddag_executor.executor.sent_requests import Heritage, SentRequests
 from mddag_executor.executor.unfinished import Unfinished
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
 from msg_graph import TaskSet
@@ -125,6 +126,7 @@ class Engine:
         self._note_time = Estimates(self.tables, self.scheduler.state).note
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
         self.attribution = Attribution(task_set)
+        self.sent_requests = SentRequests()
         #: Judges what is required of paths; None: nothing is.
         self.path_watch = PathWatch(task_set, process) if task_set is not None and any(
             path.requirements for path in task_set.paths) else None
@@ -286,6 +288,20 @@ class Engine:
         entity.ready += 1
         if 0 < entity.depth < len(waiting):
             self._drop_oldest(entity, now)
+
+    def posted(self, work: Work, now: int) -> None:
+        """Handle undeclared work that may inherit (``core.rules``, rule 15); see ``ready``."""
+        self.ready(work, now)
+        if work.heritage is not None and work.x != -1:
+            self._end_bypass().inherit(work.x, *work.heritage)
+
+    def heritage(self, work: Work) -> Heritage | None:
+        """Return what the requests of a running execution inherit; without the lock."""
+        return None if work.x < 0 else self.scheduler.heritage(work.x)
+
+    def heritage_of_task(self, work: Work) -> Heritage | None:
+        """Return what the tasks of a running execution inherit; without the lock."""
+        return self.heritage(work) if work.origin is None else None
 
     def _enqueue(self, work: Work) -> None:
         entity, since = work.entity, work.ready_ns
@@ -690,7 +706,7 @@ class Engine:
             self._bypass.running = None
             entity.failed += failed
             if self._records is not None:
-                self._records.run(work, start, end, vtid, worker)
+                self._records.run(work, -1, start, end, vtid, worker)
             return
         holders = self._holders
         if holders:
@@ -760,7 +776,7 @@ class Engine:
             if whole:  # other messages of a sync take less
                 self._note_time(vertex, entity.habit.needs_ns, entity.habit.holds, now)
         elif records is not None:
-            records.run(work, start, end, vtid, worker)
+            records.run(work, x, start, end, vtid, worker)
         if self.path_watch is not None:
             self.path_watch.left(work)
 
@@ -780,7 +796,7 @@ class Engine:
         work.entity.busy_ns += end - start
         work.suspended_ns = end
         if self._records is not None:
-            self._records.run(work, start, end, vtid, worker, goes_on=True)
+            self._records.run(work, work.x, start, end, vtid, worker, goes_on=True)
         if self.path_watch is not None:
             _, _, job, vertex = work.origin or work.answers or NO_ORIGIN
             self.path_watch.paused(work, vertex, job, start, end, work.sent)
@@ -815,7 +831,7 @@ class Engine:
         if ran:
             work.entity.busy_ns += end - start
             if self._records is not None:
-                self._records.run(work, start, end, vtid, worker)
+                self._records.run(work, work.x, start, end, vtid, worker)
         self.lend(work)
         if self.path_watch is not None:
             self.path_watch.left(work)

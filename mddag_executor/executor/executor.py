@@ -36,6 +36,7 @@ from mddag_executor.executor.announcements import Announcements
 from mddag_executor.executor.at_once import AtOnce, SignalPipe
 from mddag_executor.executor.compat import (
     BareExecutor,
+    heritage_of_response,
     is_called_by_spin,
     is_quick,
     QuickCallback,
@@ -52,6 +53,7 @@ from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.outer_groups import outer_here, OuterGroup
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.sent_requests import Heritage
 from mddag_executor.executor.settings import Thresholds
 from mddag_executor.executor.shutdown import (
     call_at_shutdown,
@@ -341,20 +343,29 @@ class MultiDeadlineExecutor(BareExecutor):
             self._task_entities.of(callback, args, outer), self, self._pool.resume,
             self._unclaimed, self._pool.loops, callback, args, kwargs)
         task.outer_group = self._pool.outer_groups.get(outer)
+        work.heritage = self._heritage(args)
         is_spinning = self._spinning.locked()
         if is_spinning:
-            self._pool.report(self._engine.ready, work)
+            self._pool.report(self._engine.posted, work)
         else:
             self._new_tasks.append(work)
         if not (is_spinning and self._pool.running):  # a spin that has just begun may not check
             self._at_once.ring()
         return task
 
+    def _heritage(self, args: tuple[Any, ...]) -> Heritage | None:
+        """Return what a task inherits: from the request whose response it handles, or its maker."""
+        found, running = heritage_of_response(args), current.running
+        if found is not None or running is None or running.pool is not self._pool or (
+                running.work is None):
+            return found
+        return self._engine.heritage_of_task(running.work)
+
     def _submit_tasks(self) -> None:
         """Post the tasks that were created outside of a spin, in rclpy's order."""
         take = self._new_tasks.pop if TASKS_NEWEST_FIRST else self._new_tasks.popleft
         while self._new_tasks:
-            self._pool.report(self._engine.ready, take())
+            self._pool.report(self._engine.posted, take())
 
     # --- interface for a host of programs --- ----------------------------------------------------
 

@@ -1,12 +1,13 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Wraps four methods of rclpy, so that the executor knows when a program calls them.
+Wraps methods of rclpy, so that the executor knows when a program calls them.
 
 Theory of operation
 -------------------
-``Publisher.publish``, ``Client.call``, ``Subscription.set_content_filter`` and the trigger of
-guard conditions are wrapped once for the process, when the first executor is made.
+``Publisher.publish``, ``Client.call``, ``Subscription.set_content_filter``, the trigger of guard
+conditions, and the methods of handles that send requests are wrapped once for the process, when
+the first executor is made.
 
 1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
 2.  *A publication on a trigger topic* is noted, so that its messages find their job
@@ -24,6 +25,7 @@ guard conditions are wrapped once for the process, when the first executor is ma
     listener (rclpy from 7.1.8 on).  So the listener is set again.
 6.  *A triggered guard condition* is announced like a message, because rcl has no listener for it.
     The method of its handle is wrapped, which also those call that have no ``GuardCondition``.
+7.  *A request* that a callback with a deadline sends is noted: it inherits (``sent_requests``).
 
 The methods are unchanged outside of callbacks of this executor, on topics without a subscription
 of an executor here.
@@ -31,13 +33,23 @@ of an executor here.
 
 from __future__ import annotations
 
+from functools import partial
 import threading
 from typing import Any
 
 from mddag_executor.executor.attribution import NO_ORIGIN, Publication, PublisherState
-from mddag_executor.executor.compat import GUARD_HANDLE, service_name
+from mddag_executor.executor.compat import (
+    ACTION_REQUESTS,
+    CLIENT_HANDLE,
+    goal_of,
+    GUARD_HANDLE,
+    service_name,
+    SERVICE_CLIENT_HANDLE,
+)
 from mddag_executor.executor.interrupts import runs_callbacks
 from mddag_executor.executor.listeners import announce_trigger
+from mddag_executor.executor.request_ids import id_of_client
+from mddag_executor.executor.sent_requests import Heritage
 from mddag_executor.executor.work import current, Runner
 from rclpy.client import Client
 from rclpy.publisher import Publisher
@@ -190,6 +202,30 @@ def publish_as_executor(publisher: Publisher, msg: Any) -> None:
         current.running = before
 
 
+def _heritage() -> tuple[Any, Heritage | None]:
+    """Return the engine of the calling callback, and what its requests inherit, if anything."""
+    running = current.running
+    work = None if running is None else running.work
+    if running is None or work is None:
+        return None, None
+    return running.engine, running.engine.heritage(work)
+
+
+def _wrap_action(kind: str, name: str) -> None:
+    """Note the requests of action clients of a kind, which a method of their handles sends."""
+    ask = getattr(CLIENT_HANDLE, name)
+
+    def send_request(self: Any, request: Any) -> Any:
+        engine, heritage = _heritage()
+        if heritage is None:
+            return ask(self, request)
+        return engine.sent_requests.send_to_action(
+            partial(ask, self, request), kind, goal_of(request), self, heritage)
+
+    send_request.__doc__ = ask.__doc__
+    setattr(CLIENT_HANDLE, name, send_request)
+
+
 def install() -> None:
     """Wrap rclpy's methods; further calls change nothing."""
     global _installed
@@ -201,6 +237,7 @@ def install() -> None:
     call = Client.call
     set_filter = getattr(Subscription, 'set_content_filter', None)
     trigger = GUARD_HANDLE.trigger_guard_condition
+    ask = SERVICE_CLIENT_HANDLE.send_request
 
     def publish(self: Any, msg: Any) -> None:
         state = self.__dict__.get(_STATE) or state_of(self)
@@ -230,6 +267,14 @@ def install() -> None:
         with running.lend(f'service {service_name(self)}'):
             return call(self, request, *args, **kwargs)
 
+    def send_request(self: Any, request: Any) -> Any:
+        engine, heritage = _heritage()
+        sender = None if heritage is None else id_of_client(self)
+        if heritage is None or sender is None:
+            return ask(self, request)
+        return engine.sent_requests.send(
+            partial(ask, self, request), sender, self, heritage)
+
     def set_content_filter(self: Any, *args: Any, **kwargs: Any) -> None:
         set_filter(self, *args, **kwargs)  # type: ignore[misc]
         for delivery in _deliveries.get(self.topic_name, ()):
@@ -245,6 +290,10 @@ def install() -> None:
     Client.call = call_and_wait  # type: ignore[method-assign]
     trigger_and_announce.__doc__ = trigger.__doc__
     GUARD_HANDLE.trigger_guard_condition = trigger_and_announce
+    send_request.__doc__ = ask.__doc__
+    SERVICE_CLIENT_HANDLE.send_request = send_request
+    for kind in ACTION_REQUESTS:
+        _wrap_action(kind, f'send_{kind}_request')
     if set_filter is not None:
         set_content_filter.__doc__ = set_filter.__doc__
         Subscription.set_content_filter = set_content_filter  # type: ignore[attr-defined]

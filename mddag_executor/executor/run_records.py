@@ -53,10 +53,15 @@ class RunRecords:
             PUBLICATION, now, vtid, address, id(message), max(0, header_stamp(message)))
 
     def run(
-        self, work: Work, start: int, end: int, vtid: int, worker: int, goes_on: bool = False
+        self, work: Work, x: int, start: int, end: int, vtid: int, worker: int,
+        goes_on: bool = False,
     ) -> None:
-        """Record the run of an undeclared callback, or of one that goes on later."""
-        self.dispatch(work, start, vtid, worker, goes_on)
+        """
+        Record the run of an undeclared callback, or of one that goes on later.
+
+        :param x: the execution, also if it has just ended; -1: the core does not know it.
+        """
+        self.dispatch(work, x, start, vtid, worker, goes_on)
         self._record('callback_start', start, vtid, work.entity.address, False)
         self._record('callback_end', end, vtid, work.entity.address)
 
@@ -80,9 +85,9 @@ class RunRecords:
             end, now, whole, leg, work.cpu_ns, state.x_holds[x])
 
     def dispatch(
-        self, work: Work, time: int, vtid: int, worker: int, goes_on: bool = False
+        self, work: Work, x: int, time: int, vtid: int, worker: int, goes_on: bool = False
     ) -> None:
-        """Record that an execution was dispatched."""
+        """Record that an execution was dispatched; see ``run``."""
         slot, dag, job, vertex = work.origin or NO_ORIGIN
         if goes_on and dag < 0:     # only this says which pieces are one execution
             job = GOES_ON
@@ -90,6 +95,8 @@ class RunRecords:
         if dag >= 0:
             index = self._tables.index_in_dag[vertex]
             deadline = self._state.job_release[slot] + self._tables.rad_offset[vertex]
+        elif x >= 0 and self._state.x_like[x] >= 0:     # it inherits
+            deadline = self._state.x_key[x][0]
         self._record(
             'dispatch', time, vtid, work.entity.address, dag, index, job, worker, work.ready_ns,
             deadline, work.due_ns)
@@ -100,7 +107,7 @@ class RunRecords:
         for work in several:
             if (state.x_state[work.x] in (WAITING, ALONE) and state.x_started[work.x] < 0
                     and work.origin is not None):
-                self.dispatch(work, now, get_native_id(), -1)
+                self.dispatch(work, work.x, now, get_native_id(), -1)
 
     def unfinished(self, several: Iterable[Unfinished], now: int) -> None:
         """Record executions that have not ended."""

@@ -28,6 +28,7 @@ from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.gaps import Gaps
 from mddag_executor.executor.kinds import ListenerEntity, Rooms
 from mddag_executor.executor.listeners import MANY, read_count, set_listener
+from mddag_executor.executor.request_ids import sender_of
 from mddag_executor.executor.work import Work
 from msg_graph.binding import Entity as Declarable
 from rclpy.qos import HistoryPolicy
@@ -321,7 +322,11 @@ class ServiceEntity(ArrivalEntity):
         if self.source >= 0:
             engine.arrived(work, None, now, -1, now)
         else:
-            engine.ready(work, now)
+            requests = engine.sent_requests
+            if not requests.is_empty():
+                work.heritage = requests.of_request(
+                    sender_of(header), header.request_id.sequence_number, header.source_timestamp)
+            engine.posted(work, now)
 
 
 class ClientEntity(ArrivalEntity):
@@ -346,8 +351,9 @@ class ClientEntity(ArrivalEntity):
     def post(self, taken: Any) -> None:
         """Complete the future of a response."""
         header, response = taken
-        pool = self.rooms.pool
+        pool, number = self.rooms.pool, header.request_id.sequence_number
         compat.complete_request(
-            self.rclpy_object, header.request_id.sequence_number, response,
-            pool.outer_groups.get(self.outer) or pool.executor)
+            self.rclpy_object, number, response,
+            pool.outer_groups.get(self.outer) or pool.executor,
+            pool.engine.sent_requests.of_response(self.handle, number))
         self.rooms.at_once.handled(self)

@@ -152,7 +152,11 @@ def executions_of(entity: Entity, pool: Hall) -> list[Work]:
     found = [Work(entity, callback, (message,))
              for callback, message in compat.feedback_taken(waitable, data, MOST)]
     if data or not found:
-        found.append(Work(entity, waitable.execute, (data,)))
+        work = Work(entity, waitable.execute, (data,))
+        requests = pool.engine.sent_requests
+        if not requests.is_empty():
+            work.heritage = requests.of_action(compat.exchanged(waitable, data))
+        found.append(work)
     return found
 
 

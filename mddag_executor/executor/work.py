@@ -98,6 +98,7 @@ class Work:
         before it starts, and for other callbacks.
     :ivar published: of a driven sync, the topics that it has published.
     :ivar sent: its publications on topics of ``PathWatch.topics``, with their times.
+    :ivar heritage: what it inherits (see ``sent_requests``); None: nothing.
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar due_ns: when its timer was due, on the trace's clock; 0: it is of no timer.
@@ -112,6 +113,7 @@ class Work:
     coroutine: Any = None
     origin: Origin | None = None
     answers: Origin | None = None
+    heritage: tuple[int, int] | None = None
     published: frozenset[str] = frozenset()
     sent: tuple[tuple[str, int], ...] = ()
     x = worker = -1

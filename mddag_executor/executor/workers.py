@@ -235,12 +235,12 @@ class WorkerPool:
             partial(get_logger('mddag_executor').warning, printable(text)))
 
     def post(self, several: list[Work]) -> None:
-        """Make undeclared executions ready."""
+        """Make undeclared executions ready, some of which may inherit."""
         self.report(self._post, several)
 
     def _post(self, several: list[Work], now: int) -> None:
         for work in several:
-            self.engine.ready(work, now)
+            self.engine.posted(work, now)
             now = self.tick()  # a recording distinguishes them by it
 
     def resume(self, work: Work) -> None:

@@ -22,7 +22,7 @@ _TIMES = {'release', 'noticed', 'ready', 'began', 'start', 'end', 'busy', 'cpu',
 _COMPLETES = 'nothing', 'leg', 'vertex'
 """Names of the values of ``completes``."""
 # Columns that are only used to build tables.
-_INNER = {'order', 'due'}
+_INNER = {'order', 'due', 'inherited'}
 
 
 class Words(NamedTuple):

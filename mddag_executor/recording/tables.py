@@ -21,6 +21,8 @@ Theory of operation
 7. ``order`` is the position in the sequence in which the executor's core processed releases,
    completions and ends of jobs.  It decides between equal times.
 8. ``due`` is when an undeclared timer's execution was due by its period; 0 if unknown.
+9. ``inherited`` is the deadline that an undeclared execution has inherited, because a callback
+   with this deadline has sent the request (``core.rules``, rule 15); 0: none.
 """
 
 from __future__ import annotations
@@ -53,7 +55,8 @@ RELEASES = _table(
 EXECUTIONS = _table(
     process='i2', callback='i8', dag='i2', vertex='i4', job='i8', leg='i2', piece='i4',
     thread='i4', worker='i2', ready='i8', began='i8', start='i8', end='i8', busy='i8', cpu='i8',
-    holds_gil='?', completes='i1', guessed='?', message='i4', order='i4', due='i8')
+    holds_gil='?', completes='i1', guessed='?', message='i4', order='i4', due='i8',
+    inherited='i8')
 PUBLICATIONS = _table(
     process='i2', publisher='i8', execution='i8', vertex='i4', time='i8', source_timestamp='i8',
     header_stamp='i8')

@@ -7,7 +7,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from mddag_executor.executor.compat import alive, BareExecutor, QuickCallback
+from mddag_executor.executor.compat import (
+    alive,
+    BareExecutor,
+    heritage_of_response,
+    QuickCallback,
+)
 from mddag_executor.executor.tasks import make_task, TaskEntity, Unclaimed
 from mddag_executor.executor.work import Work
 from mddag_executor.hosting.guest import Guest
@@ -44,7 +49,8 @@ class NodeHolder(BareExecutor):
 
         task, work = make_task(
             self.task_entity, self, resume, self._unclaimed, None, callback, args, kwargs)
-        loop.call_in_run(lambda: loop.engine.ready(work, loop.now))
+        work.heritage = heritage_of_response(args) or loop.heritage(of_task=True)
+        loop.call_in_run(lambda: loop.engine.posted(work, loop.now))
         return task
 
     def on_callback_ended(

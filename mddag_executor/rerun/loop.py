@@ -44,6 +44,7 @@ from mddag_executor.core.state import DONE, empty
 from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
+from mddag_executor.executor.sent_requests import Heritage
 from mddag_executor.executor.work import Destroyed, Refused, Work
 from mddag_executor.hosting.loading import describe
 from mddag_executor.rerun.durations import Durations
@@ -181,6 +182,14 @@ class Loop:
     def current(self) -> Execution | None:
         """Return the execution whose callback runs in the calling thread; None for no callback."""
         return self._current if self.in_run else None
+
+    def heritage(self, of_task: bool = False) -> Heritage | None:
+        """Return what a request of the calling callback inherits, or its task; None: nothing."""
+        execution = self.current
+        if execution is None:
+            return None
+        inherited = self.engine.heritage_of_task if of_task else self.engine.heritage
+        return inherited(execution.work)
 
     def here(self) -> str:
         """Return what runs, for messages."""

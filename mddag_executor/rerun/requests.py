@@ -32,11 +32,13 @@ from mddag_executor.executor.compat import (
     feedback_taken,
     goal_states,
     has_result,
+    HERITAGE,
     new_request,
     SERVER_HANDLE,
     service_name,
 )
 from mddag_executor.executor.registry import Registry
+from mddag_executor.executor.sent_requests import Heritage
 from mddag_executor.executor.sources import ServiceEntity
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
@@ -60,6 +62,8 @@ class Requests:
         # clients and servers of actions with their names, by the id of their handles
         self._actions: dict[int, tuple[str, Any]] = {}
         self._result_timeout_ns: dict[int, int] = {}  # by the id of a server's handle
+        # by the number of a request to an action: what its response inherits
+        self._heritages: dict[int, Heritage] = {}
 
     def install(self, replacements: Replacements) -> None:
         """Have clients and servers use this."""
@@ -112,7 +116,10 @@ class Requests:
             pass
         number = next(self._numbers)
         future = new_request(client, number)
-        self._send(request, partial(self._ask, client, number))
+        heritage = self._loop.heritage()
+        if heritage is not None:
+            setattr(future, HERITAGE, heritage)
+        self._send(request, partial(self._ask, client, number, heritage))
         return future
 
     def call(self, client: Client, request: Any, timeout_sec: float | None = None) -> Any:
@@ -126,7 +133,9 @@ class Requests:
             raise error
         return future.result()
 
-    def _ask(self, client: Client, number: int, request: Any) -> None:
+    def _ask(
+        self, client: Client, number: int, heritage: Heritage | None, request: Any
+    ) -> None:
         name = service_name(client)
         entity = self._service(name)
         if entity is None:
@@ -140,7 +149,8 @@ class Requests:
         if entity.source >= 0:
             engine.arrived(work, None, now, -1, now)
         else:
-            engine.ready(work, now)
+            work.heritage = heritage
+            engine.posted(work, now)
 
     def send_response(self, service: Any, response: Any, header: Header) -> None:
         """Send a response."""
@@ -191,11 +201,14 @@ class Requests:
     def _ask_action(self, kind: str, handle: Any, request: Any) -> int:
         number = next(self._numbers)
         name, client = self._actions[id(handle)]
+        heritage = self._loop.heritage()
+        if heritage is not None:
+            self._heritages[number] = heritage
 
         def deliver(request: Any) -> None:
             servers = self._peers(handle)
             if servers:
-                self._take(servers[0], {kind: ((client, number), request)})
+                self._take(servers[0], {kind: ((client, number), request)}, heritage)
             else:
                 self._loop.warn(
                     f'{name}: it is called, and no node of the run offers this action')
@@ -205,7 +218,9 @@ class Requests:
 
     def _answer_action(self, kind: str, handle: Any, header: Header, response: Any) -> None:
         client, number = header
-        self._send(response, lambda response: self._take(client, {kind: (number, response)}))
+        heritage = self._heritages.pop(number, None)
+        self._send(response, lambda response: self._take(
+            client, {kind: (number, response)}, heritage))
 
     def _feedback(self, handle: Any, message: Any) -> None:
         def deliver(message: Any) -> None:
@@ -241,12 +256,18 @@ class Requests:
             self._loop.at(at, TIMER, self._ready, server, lambda ended: server.execute(
                 {'expired': [info for info in ended if has_result(server, info)]}), ended)
 
-    def _take(self, waitable: Any, data: dict[str, Any]) -> None:
+    def _take(
+        self, waitable: Any, data: dict[str, Any], heritage: Heritage | None = None
+    ) -> None:
         attach_futures(waitable, self._executor)
-        self._ready(waitable, waitable.execute, data)
+        self._ready(waitable, waitable.execute, data, heritage)
 
-    def _ready(self, waitable: Any, function: Callable[[Any], Any], argument: Any) -> None:
+    def _ready(
+        self, waitable: Any, function: Callable[[Any], Any], argument: Any,
+        heritage: Heritage | None = None,
+    ) -> None:
         entity = self._registry.by_id.get(id(waitable))
         if entity is not None and not entity.removed:
-            engine = self._loop.engine
-            engine.ready(Work(entity, function, (argument,)), self._loop.now)
+            work = Work(entity, function, (argument,))
+            work.heritage = heritage
+            self._loop.engine.posted(work, self._loop.now)

@@ -28,6 +28,7 @@ from typing import NamedTuple
 from mddag_executor.core.jobs import finish, give_up, is_miss, release_job
 from mddag_executor.core.overload import admit
 from mddag_executor.core.policies import KeyFunction
+from mddag_executor.core.inheritance import inherit
 from mddag_executor.core.rules import complete, make_ready, ready_undeclared
 from mddag_executor.core.state import (
     add_slot,
@@ -198,6 +199,8 @@ def release_load(
             t, s, key, job, -1, load.holds[cost] if len(load.holds) > 0 else 0, -1, now)
         s.job_index[s.x_slot[x]] = job
         s.x_cost[x] = s.x_left[x] = load.costs[cost]
+        if len(load.inherited) > 0:
+            inherit(t, s, x, load.inherited[job], load.inherits_from[job])
         return
     release = load.releases[i] if len(load.releases) > 0 else now
     slot = release_job(t, s, dag, job, release, now)

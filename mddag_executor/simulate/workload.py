@@ -38,6 +38,9 @@ class Workload(NamedTuple):
     ``delays[delay_base[d] + k * delay_stride[d] + e]`` is how long after a vertex's completion its
     edge e in job k of DAG d is satisfied (see ``deliveries``); the edges of a DAG are numbered as
     in ``Tables.successors``, from its first vertex on.
+
+    ``inherited`` is, by job of the undeclared DAG, the priority that it inherits, and
+    ``inherits_from`` the vertex (see ``core.inheritance``; NEVER: none).  Both may be empty.
     """
 
     times: list[int]
@@ -53,6 +56,8 @@ class Workload(NamedTuple):
     delays: list[int] = []
     delay_base: list[int] = []
     delay_stride: list[int] = []
+    inherited: list[int] = []
+    inherits_from: list[int] = []
 
 
 Arrays = TypeVar('Arrays', Workload, Tables)

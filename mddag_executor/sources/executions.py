@@ -244,7 +244,8 @@ class ExecutionJoin:
         self._executions.more(
             len(dispatch), callback=dispatch['callback'], dag=dag, vertex=vertex,
             job=dispatch['job'], worker=dispatch['worker'], thread=thread, ready=ready,
-            began=start, start=start)
+            began=start, start=start,
+            inherited=np.where(dag < 0, dispatch['reference_deadline'], 0))
         self._dispatches.add(thread, dispatch.place, np.arange(before, len(self._executions)))
 
     def _owned(self, events: Batches) -> tuple[Ints, Ints]:

@@ -61,7 +61,8 @@ import numpy as np
 _BITS = 48
 _NO_ADDRESSES = {'queue_depth', 'message_timestamp'}
 _TIMES = {
-    'releases': ('release', 'noticed'), 'executions': ('ready', 'began', 'start', 'end'),
+    'releases': ('release', 'noticed'),
+    'executions': ('ready', 'began', 'start', 'end', 'inherited'),
     'publications': ('time', 'source_timestamp'), 'job_ends': ('time',),
     'drops': ('time',), 'losses': ('time',), 'demotions': ('time',),
     'misses': ('deadline', 'completed'), 'stops': ('start', 'end'), 'unfinished': ('start',)}

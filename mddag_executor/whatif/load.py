@@ -161,7 +161,7 @@ class LoadBuilder:
             release[:] = jobs.release[mine]
             noticed[:] = np.maximum(jobs.release[mine], jobs.noticed[mine])
         self._note_ends()
-        self._others, self._dispatch_ns = [np.empty((0, 3), dtype=np.int64)], np.empty(
+        self._others, self._dispatch_ns = [np.empty((0, 4), dtype=np.int64)], np.empty(
             0, dtype=np.int64)
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
@@ -225,9 +225,10 @@ class LoadBuilder:
             self._find_turns(number, start[mine], end[mine])
         ready[~first] = start[~first]
         others = np.flatnonzero(vertex < 0)
-        # ready, duration, index of the dispatch time or -1: undeclared callbacks, and legs that
-        # completed nothing
-        self._others = [np.column_stack((ready[others], (end - start)[others], others))]
+        # ready, duration, index of the dispatch time or -1, inherited deadline or 0: undeclared
+        # callbacks, and legs that completed nothing
+        self._others = [np.column_stack((
+            ready[others], (end - start)[others], others, table['inherited'][rows[others]]))]
         source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
         turn = self._columns['turn'][self._places(_JOB, row[source], vertex[source])]
         known = first[source] & (turn >= 0)
@@ -299,7 +300,8 @@ class LoadBuilder:
         columns['arrived'][self._places(_EDGE, row[known], vertex[known]) + edge[known]] = ready[
             known]
         self._others.append(np.column_stack((
-            ready[~ended], table['busy'][rows[~ended]], np.full(int((~ended).sum()), _UNKNOWN))))
+            ready[~ended], table['busy'][rows[~ended]], np.full(int((~ended).sum()), _UNKNOWN),
+            np.zeros(int((~ended).sum()), dtype=np.int64))))
         place, done = self._places(_VERTEX, row[ended], vertex[ended]), rows[ended]
         for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
                              ('start', 'began'), ('end', 'end')):
@@ -411,11 +413,26 @@ class LoadBuilder:
                 'computed': np.concatenate([cpu, more + _UNKNOWN]) if (cpu >= 0).any() else [],
                 'delays': delays, 'delay_stride': self._widths[_EDGE].tolist(),
                 'delay_base': self._begins[_EDGE, :-1].tolist()}
+        if others[:, 3].any():
+            columns |= self._inherited(others[:, 0], others[:, 3])
         del took, cpu, held
         load = self._load(costs, others[:, 0], overheads, workers == 1)
         return RecordedLoad(
             load._replace(fates=self._fates(len(costs)), **columns),
             self._numbers, demand, executions, estimated, unknown, usual, transport, late)
+
+    def _inherited(self, ready: Ints, deadline: Ints) -> dict[str, Any]:
+        """
+        Return what undeclared executions inherit (see ``Workload``).
+
+        A recording has only the deadline.  It is of a vertex whose relative deadline is not
+        shorter than the rest of it was.
+        """
+        offsets = np.array(self._tables.rad_offset[:-1], dtype=np.int64)
+        order = np.argsort(offsets, kind='stable')
+        at = np.searchsorted(offsets[order], deadline - ready)
+        return {'inherited': np.where(deadline > 0, deadline, NEVER),
+                'inherits_from': order[np.minimum(at, len(order) - 1)]}
 
     def _unsent(self) -> list[Any]:
         """Return by DAG, job and edge whether the edge was not published, as far as known."""

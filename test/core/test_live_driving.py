@@ -156,6 +156,11 @@ class LiveDriver(RuleBasedStateMachine):
         else:
             self.undeclared(group, holds, 0)
 
+    @rule(group=ANY_GROUP, holds=HOLDS, queue=st.integers(0, 2), inherits=st.integers(-2, 12))
+    def requested(self, group, holds, queue, inherits):
+        self.undeclared(group, holds, queue)
+        self.scheduler.inherit(self.runs[-1].x, self.now + inherits * TICK, 0)
+
     @rule(group=ANY_GROUP, holds=HOLDS, queue=st.integers(0, 2))
     def undeclared(self, group, holds, queue):
         self.counter['undeclared'] += 1

@@ -1,0 +1,262 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""A service or action is as urgent as the callback with a deadline that has sent the request."""
+
+import inspect
+import threading
+import time
+
+from msg_graph import loads
+import pytest
+from rclpy.action import ActionClient, ActionServer
+from rclpy.callback_groups import ReentrantCallbackGroup
+from std_msgs.msg import Empty
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+from .conftest import matched, Spinning, wait_for
+from .declared import graph
+
+# the default deadline is ten times as long, and nothing depends on the speed of the machine
+URGENT = graph(urgent='name: control, subscription: /go, period: 30s, deadline: 30s')
+OTHERS = [*range(6)]
+
+
+class Asking:
+    """
+    A callback with a deadline that sends requests while other callbacks wait already.
+
+    :param ask: what it does, a function or a coroutine function; it gets this object.
+    :param text: the declaration; None: the callback has no deadline.
+    :param pause_s: how long each of the others takes.
+    :ivar ran: what has run, in order: the numbers of the others, and names.
+    """
+
+    def __init__(self, make_executor, make_node, ask, text=URGENT, pause_s=0.0, **more):
+        self.ran, self._ask, self._pause_s = [], ask, pause_s
+        self.group = ReentrantCallbackGroup()
+        self.node, self.serving = make_node('urgent'), make_node('serving')
+        self.executor = make_executor(
+            None if text is None else loads(text), nodes=[self.node, self.serving],
+            **{'num_workers': 1, 'default_deadline': '300s', **more})
+        self.node.create_subscription(
+            Empty, '/go', self._wait if inspect.iscoroutinefunction(ask) else self._call, 1,
+            callback_group=self.group)
+        self._publisher = make_node('other').create_publisher(Empty, '/go', 1)
+        self.clients = {}
+
+    def serve(self, name, answer=None, client_node=None):
+        """Create a service with its client; its callback notes the name, or is given."""
+        self.serving.create_service(
+            Trigger, f'/{name}', self._noting(name) if answer is None else answer,
+            callback_group=self.group)
+        self.clients[name] = (client_node or self.node).create_client(
+            Trigger, f'/{name}', callback_group=self.group)
+
+    def _noting(self, name):
+        def answer(request, response):
+            self.ran.append(name)
+            return response
+        return answer
+
+    def request(self, name):
+        return self.clients[name].call_async(Trigger.Request())
+
+    def call(self, name):
+        return self.clients[name].call(Trigger.Request(), timeout_sec=60.0)
+
+    def begin_others(self):
+        """Let other callbacks wait from now on."""
+        def run(number):
+            time.sleep(self._pause_s)
+            self.ran.append(number)
+        for number in OTHERS:
+            self.executor.create_task(run, number)
+
+    async def _wait(self, _):
+        self.begin_others()
+        await self._ask(self)
+        self.ran.append('control')
+
+    def _call(self, _):
+        self.begin_others()
+        self._ask(self)
+        self.ran.append('control')
+
+    def run(self, spinning=Spinning, names=('control',)):
+        """Run the callback once; return what has run, in order, once these names have."""
+        with spinning(self.executor):
+            assert all(client.wait_for_service(15.0) for client in self.clients.values())
+            matched(self._publisher)
+            self._publisher.publish(Empty())
+            assert wait_for(lambda: {*names, *OTHERS} <= {*self.ran}), self.ran
+        return self.ran
+
+
+async def await_answer(each):
+    await each.request('ask')
+
+
+def test_a_service_goes_before_what_is_less_urgent_than_its_client(
+        make_executor, make_node, spinning):
+    each = Asking(make_executor, make_node, await_answer)
+    each.serve('ask')
+    assert each.run(spinning) == ['ask', 'control', *OTHERS]
+
+
+def test_a_request_of_a_callback_without_a_deadline_waits_for_its_turn(make_executor, make_node):
+    each = Asking(make_executor, make_node, await_answer, text=None)
+    each.serve('ask')
+    assert each.run() == [*OTHERS, 'ask', 'control']
+
+
+@pytest.mark.parametrize('policy', ['gedf', 'llf', 'fifo', 'rm'])
+def test_requests_inherit_times_only(make_executor, make_node, policy):
+    each = Asking(make_executor, make_node, await_answer, policy=policy)
+    each.serve('ask')
+    order = each.run()
+    assert order[0] == ('ask' if policy in ('gedf', 'llf') else 0)
+
+
+def test_a_callback_that_waits_in_a_call_waits_for_no_less_urgent_one(make_executor, make_node):
+    """But for the one that begins before the request has arrived."""
+    each = Asking(make_executor, make_node, lambda each: each.call('ask'), pause_s=0.1)
+    each.serve('ask')
+    order = each.run()
+    assert order.index('ask') < order.index(OTHERS[-1])
+    assert order.index('control') < order.index(OTHERS[-1])
+
+
+def test_a_service_that_asks_another_one_passes_it_on(make_executor, make_node):
+    async def answer(request, response):
+        each.ran.append('ask')
+        await each.request('further')
+        each.ran.append('answer')
+        return response
+
+    each = Asking(make_executor, make_node, await_answer)
+    each.serve('ask', answer)
+    each.serve('further', client_node=each.serving)
+    assert each.run() == ['ask', 'further', 'answer', 'control', *OTHERS]
+
+
+def test_the_callback_of_a_response_is_as_urgent(make_executor, make_node):
+    """Also if it is added when the response has come."""
+    def ask(each):
+        for name in ('ask', 'late'):
+            each.futures.append(each.request(name))
+        each.futures[0].add_done_callback(lambda future: each.ran.append('answered'))
+
+    async def add_late(each):
+        ask(each)
+        await each.futures[1]
+        each.futures[1].add_done_callback(lambda future: each.ran.append('answered late'))
+
+    each = Asking(make_executor, make_node, add_late)
+    each.futures = []
+    each.serve('ask')
+    each.serve('late')
+    order = each.run(names=('control', 'answered', 'answered late'))
+    assert {*order[:5]} == {'ask', 'late', 'answered', 'control', 'answered late'}
+
+
+def test_requests_of_threads_and_of_other_executors_are_not_urgent(make_executor, make_node):
+    """They may come while an urgent one of the same client does."""
+    def ask(each):
+        thread = threading.Thread(target=lambda: each.requests.append(each.request('ask')))
+        thread.start()
+        thread.join()
+
+    each = Asking(make_executor, make_node, ask)
+    each.requests = []
+    each.serve('ask')
+    assert each.run(names=('ask', 'control')) == ['control', *OTHERS, 'ask']
+
+
+def test_requests_of_one_service_keep_their_order(make_executor, make_node):
+    """Those before an urgent one are not overtaken by it: they go before what is less urgent."""
+    def ask(each):
+        thread = threading.Thread(target=each.request, args=('ask',))
+        thread.start()
+        thread.join()
+        each.request('ask')
+
+    def answer(request, response):
+        each.ran.append(('ask', len(each.ran)))
+        return response
+
+    each = Asking(make_executor, make_node, ask)
+    each.serve('ask', answer)
+    order = each.run(names=('control', ('ask', 2)))
+    assert order == ['control', ('ask', 1), ('ask', 2), *OTHERS]
+
+
+def test_a_service_with_a_deadline_of_its_own_keeps_it(make_executor, make_node):
+    text = URGENT + """
+  - node: /serving
+    callbacks:
+      - {name: ask, service: /ask, period: 1s, sporadic: true, deadline: 400s}
+"""
+    each = Asking(make_executor, make_node, await_answer, text=text)
+    each.serve('ask')
+    assert each.run() == [*OTHERS, 'ask', 'control']
+
+
+def test_a_request_of_a_late_callback_waits_for_its_turn(make_executor, make_node):
+    """Its deadline is over: nothing that can be in time waits for it."""
+    async def ask(each):
+        time.sleep(0.05)
+        await each.request('ask')
+
+    text = graph(urgent='name: control, subscription: /go, period: 30s, deadline: 20ms')
+    each = Asking(make_executor, make_node, ask, text=text)
+    each.serve('ask')
+    assert each.run() == [*OTHERS, 'ask', 'control']
+
+
+def test_an_action_is_as_urgent_as_its_client(make_executor, make_node):
+    """Goal, result and cancellation, and all that they start."""
+    async def ask(each):
+        goal = await each.action.send_goal_async(Fibonacci.Goal(order=1))
+        each.ran.append('accepted')
+        result = await goal.get_result_async()
+        each.ran.append(tuple(result.result.sequence))
+        await goal.cancel_goal_async()
+        each.ran.append('not canceled')
+
+    def execute(goal):
+        each.ran.append('goal')
+        goal.succeed()
+        return Fibonacci.Result(sequence=[7])
+
+    each = Asking(make_executor, make_node, ask)
+    server = ActionServer(each.serving, Fibonacci, 'count', execute, callback_group=each.group)
+    each.action = ActionClient(each.node, Fibonacci, 'count', callback_group=each.group)
+    each.clients = {'count': each.action}
+    each.action.wait_for_service = each.action.wait_for_server
+    order = each.run()
+    assert sorted(map(str, order[:5])) == sorted(
+        ['accepted', 'goal', '(7,)', 'not canceled', 'control'])
+    assert order[5:] == OTHERS
+    server.destroy()
+    each.action.destroy()
+
+
+def test_requests_are_forgotten(make_executor, make_node):
+    """Also those that are not answered."""
+    from mddag_executor.executor.bounds import MOST
+
+    from .inside import engine_of
+
+    async def ask(each):
+        for _ in range(20 * MOST):
+            each.request('silent')
+        for _ in range(3):
+            await each.request('ask')
+
+    each = Asking(make_executor, make_node, ask)
+    each.serve('ask')
+    each.clients['silent'] = each.node.create_client(Trigger, '/silent')
+    each.clients['silent'].wait_for_service = lambda timeout: True
+    each.run()
+    assert len(engine_of(each.executor).sent_requests._notes) <= 4 * MOST
