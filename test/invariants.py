@@ -104,7 +104,8 @@ def _queues(t: Tables, s: State) -> Iterator[str]:
             if s.x_state[x] != WAITING or s.x_queue[x] != queue or s.x_started[x] >= 0:
                 yield f'execution {x} in queue {queue} has state {s.x_state[x]}'
         found.update(waiting)
-        if waiting and s.queue_demoted[queue] < 0 and s.queue_key[queue] > _last_place(t, s, first):
+        if waiting and s.queue_demoted[queue] < 0 and (
+                s.queue_key[queue] > _last_place(t, s, first)):
             yield f'queue {queue} is not late, and comes after its first execution'
         if not waiting and (s.queue_demoted[queue] >= 0 or s.queue_place[queue] != READY):
             yield f'queue {queue} is empty, and is late or set aside'

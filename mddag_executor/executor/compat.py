@@ -312,6 +312,14 @@ def goal_of(request: Any) -> bytes:
     return bytes(getattr(request, 'goal_info', request).goal_id.uuid)
 
 
+def receiver_of(waitable: Any) -> Any:
+    """Return the key of an action's waitable as a receiver (``sent_requests``), or None."""
+    client = getattr(waitable, '_client_handle', None)
+    if type(client) is CLIENT_HANDLE:
+        return client
+    return 'action' if type(getattr(waitable, '_handle', None)) is SERVER_HANDLE else None
+
+
 def exchanged(waitable: Any, data: Any) -> list[tuple[Any, ...]]:
     """
     Return which requests an action server has taken, or which responses an action client.

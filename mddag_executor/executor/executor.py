@@ -354,7 +354,7 @@ class MultiDeadlineExecutor(BareExecutor):
         return task
 
     def _heritage(self, args: tuple[Any, ...]) -> Heritage | None:
-        """Return what a task inherits: from the request whose response it handles, or its maker."""
+        """Return what a task inherits: of the request whose response it handles, or its maker."""
         found, running = heritage_of_response(args), current.running
         if found is not None or running is None or running.pool is not self._pool or (
                 running.work is None):

@@ -59,6 +59,7 @@ class Hall(Protocol):
     loop: EventLoop
     announcements: Announced | None
     fail: Callable[[BaseException], None]
+    running: bool
     now: int
     lock: Any
     context: Any
@@ -72,6 +73,12 @@ class Hall(Protocol):
     @property
     def executor(self) -> Spinner | None:
         """Return the executor; None: it has been destroyed."""
+
+    def is_inside(self) -> bool:
+        """Return whether the calling thread owns the lock."""
+
+    def report(self, event: Callable[..., None], *args: Any) -> None:
+        """Report an event, which gets the time."""
 
     def tick(self) -> int:
         """Return the engine's time now."""

@@ -43,8 +43,9 @@ from mddag_executor.executor.compat import (
     CLIENT_HANDLE,
     goal_of,
     GUARD_HANDLE,
-    service_name,
+    SERVER_HANDLE,
     SERVICE_CLIENT_HANDLE,
+    service_name,
 )
 from mddag_executor.executor.interrupts import runs_callbacks
 from mddag_executor.executor.listeners import announce_trigger
@@ -211,9 +212,10 @@ def _heritage() -> tuple[Any, Heritage | None]:
     return running.engine, running.engine.heritage(work)
 
 
-def _wrap_action(kind: str, name: str) -> None:
-    """Note the requests of action clients of a kind, which a method of their handles sends."""
-    ask = getattr(CLIENT_HANDLE, name)
+def _wrap_action(kind: str) -> None:
+    """Wrap the methods that send a kind of requests to actions, and the responses."""
+    ask = getattr(CLIENT_HANDLE, f'send_{kind}_request')
+    answer = getattr(SERVER_HANDLE, f'send_{kind}_response')
 
     def send_request(self: Any, request: Any) -> Any:
         engine, heritage = _heritage()
@@ -222,8 +224,15 @@ def _wrap_action(kind: str, name: str) -> None:
         return engine.sent_requests.send_to_action(
             partial(ask, self, request), kind, goal_of(request), self, heritage)
 
-    send_request.__doc__ = ask.__doc__
-    setattr(CLIENT_HANDLE, name, send_request)
+    def send_response(self: Any, header: Any, response: Any) -> None:
+        answer(self, header, response)
+        engine, heritage = _heritage()
+        if heritage is not None:
+            engine.sent_requests.receive_responses()
+
+    send_request.__doc__, send_response.__doc__ = ask.__doc__, answer.__doc__
+    setattr(CLIENT_HANDLE, f'send_{kind}_request', send_request)
+    setattr(SERVER_HANDLE, f'send_{kind}_response', send_response)
 
 
 def install() -> None:
@@ -269,11 +278,11 @@ def install() -> None:
 
     def send_request(self: Any, request: Any) -> Any:
         engine, heritage = _heritage()
-        sender = None if heritage is None else id_of_client(self)
-        if heritage is None or sender is None:
+        known = None if heritage is None else id_of_client(self)
+        if heritage is None or known is None:
             return ask(self, request)
         return engine.sent_requests.send(
-            partial(ask, self, request), sender, self, heritage)
+            partial(ask, self, request), *known, self, heritage)
 
     def set_content_filter(self: Any, *args: Any, **kwargs: Any) -> None:
         set_filter(self, *args, **kwargs)  # type: ignore[misc]
@@ -293,7 +302,7 @@ def install() -> None:
     send_request.__doc__ = ask.__doc__
     SERVICE_CLIENT_HANDLE.send_request = send_request
     for kind in ACTION_REQUESTS:
-        _wrap_action(kind, f'send_{kind}_request')
+        _wrap_action(kind)
     if set_filter is not None:
         set_content_filter.__doc__ = set_filter.__doc__
         Subscription.set_content_filter = set_content_filter  # type: ignore[attr-defined]

@@ -57,8 +57,23 @@ class _ServiceInfo(ctypes.Structure):
         ('client', ctypes.c_ubyte * _ID_SIZE), ('sequence_number', ctypes.c_int64))
 
 
-def id_of_client(handle: Any) -> bytes | None:
-    """Return the id that requests have of the client with a handle, which is entered, if known."""
+_service_name = _rcl.rcl_service_get_service_name
+_service_name.argtypes = [ctypes.c_void_p]
+_service_name.restype = ctypes.c_char_p
+
+
+def name_of_service(handle: Any) -> str:
+    """Return the name of the service with a handle, which is entered."""
+    name: bytes | None = _service_name(handle.pointer)
+    return '' if name is None else name.decode()
+
+
+def id_of_client(handle: Any) -> tuple[bytes, str] | None:
+    """
+    Return the id in the requests of a client, and the name of the service; None: unknown.
+
+    :param handle: the client's, which is entered.
+    """
     gid = _Gid()
     address = _rmw_client(handle.pointer)
     if address is None or _id_of_writer(address, ctypes.byref(gid)) != 0:
@@ -72,7 +87,7 @@ def id_of_client(handle: Any) -> bytes | None:
     if place < _ID_SIZE or len(reader) < _ID_SIZE or reader[-1] != _READER_KIND or (
             reader[:_PARTICIPANT_SIZE] != writer[:_PARTICIPANT_SIZE]):
         return None
-    return reader
+    return reader, client.service_name.decode()
 
 
 def sender_of(header: Any) -> bytes | None:

@@ -13,6 +13,9 @@ Theory of operation
     other, so a request that is not older than the one that is just being sent is this one.
 3.  A request to an action is identified by its goal.
 4.  Another note is for the response: its callbacks inherit the same.
+5.  *Delivery within the process.*  The middleware delivers within ``send``.  So the sending thread
+    takes the request itself (its *receivers*), and the thread that sends the response takes that
+    one.  Otherwise the worker would begin something less urgent before it knows of them.
 
 Requests that others have sent are never found: those of other processes, of other executors, of
 threads outside of callbacks, and of undeclared callbacks that inherit nothing.
@@ -30,7 +33,7 @@ from mddag_executor.executor.bounds import MOST
 Heritage = tuple[int, int]
 """What a request inherits: a priority, and the vertex of the execution that has it."""
 
-SERVICE = 'service'
+SERVICE, ACTION = 'service', 'action'
 
 
 class SentRequests:
@@ -41,14 +44,43 @@ class SentRequests:
         self._notes: dict[Any, Heritage] = {}
         # by client: what the request inherits that is just being sent, and since when
         self._sending: dict[bytes, tuple[Heritage, int]] = {}
+        # what takes the arrivals of a service, by its name; of action servers; of clients
+        self._receivers: dict[Any, tuple[Callable[[], object], ...]] = {}
+
+    def add_receiver(self, key: Any, receive: Callable[[], object]) -> None:
+        """
+        Let a function take the arrivals of a service or client of the executor at once.
+
+        :param key: the name of a service, ``ACTION`` for an action server, or a client's handle.
+        """
+        self._receivers[key] = (*self._receivers.get(key, ()), receive)
+
+    def remove_receiver(self, key: Any, receive: Callable[[], object]) -> None:
+        """End ``add_receiver``; does nothing if it was not called."""
+        rest = tuple(each for each in self._receivers.get(key, ()) if each != receive)
+        if rest:
+            self._receivers[key] = rest
+        else:
+            self._receivers.pop(key, None)
+
+    def _receive(self, key: Any) -> None:
+        for receive in self._receivers.get(key, ()):
+            receive()
+
+    def receive_responses(self) -> None:
+        """Take a response that was just sent: one to a request of which there is a note."""
+        for client in {key[0] for key in list(self._notes) if len(key) == 3}:
+            self._receive(client)
 
     def send(
-        self, send: Callable[[], int], sender: bytes, client: Any, heritage: Heritage
+        self, send: Callable[[], int], sender: bytes, service: str, client: Any,
+        heritage: Heritage,
     ) -> int:
         """
         Send a request to a service; return its sequence number.
 
-        :param sender: the middleware's id of the client; ``client``: its handle.
+        :param sender: the middleware's id of the client; ``service``: the name of the service.
+        :param client: the client's handle.
         """
         self._sending[sender] = heritage, time_ns()
         try:
@@ -57,6 +89,7 @@ class SentRequests:
         finally:
             self._sending.pop(sender, None)
         self._note((client, SERVICE, number), heritage)
+        self._receive(service)
         return number
 
     def send_to_action(
@@ -70,6 +103,7 @@ class SentRequests:
         self._note((kind, goal), heritage)
         number = send()
         self._note((client, kind, number), heritage)
+        self._receive(ACTION)
         return number
 
     def _note(self, key: Any, heritage: Heritage) -> None:

@@ -28,7 +28,7 @@ from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.gaps import Gaps
 from mddag_executor.executor.kinds import ListenerEntity, Rooms
 from mddag_executor.executor.listeners import MANY, read_count, set_listener
-from mddag_executor.executor.request_ids import sender_of
+from mddag_executor.executor.request_ids import name_of_service, sender_of
 from mddag_executor.executor.work import Work
 from msg_graph.binding import Entity as Declarable
 from rclpy.qos import HistoryPolicy
@@ -282,7 +282,7 @@ class ServiceEntity(ArrivalEntity):
     list_name = 'services'
     is_known_to_caret = True
 
-    __slots__ = ()
+    __slots__ = ('_name',)
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
@@ -297,8 +297,27 @@ class ServiceEntity(ArrivalEntity):
     def listen(self, rooms: Rooms) -> None:
         """Let requests be collected; the built-in services of a node share a descriptor."""
         self._take = compat.request_taker(self.rclpy_object)
+        with self.handle:
+            self._name = name_of_service(self.handle)
+        rooms.pool.engine.sent_requests.add_receiver(self._name, self.receive)
         self.listen_in(rooms, rooms.pool.loop,
                        f'services {self.node}' if compat.is_builtin(self.rclpy_object) else '')
+
+    def ignore(self) -> None:
+        """End ``listen``."""
+        if self.fd >= 0:
+            self.rooms.pool.engine.sent_requests.remove_receiver(self._name, self.receive)
+        super().ignore()
+
+    def receive(self) -> None:
+        """Collect a request in the thread that has just sent it."""
+        pool = self.rooms.pool
+        if not pool.is_inside():
+            pool.report(self._collect_now)
+
+    def _collect_now(self, now: int) -> None:
+        if self.rooms.pool.running:
+            self.collect()
 
     def record(self, say: Callable[..., None], node: int) -> None:
         """Record it with CARET's tracepoints."""
@@ -326,7 +345,15 @@ class ServiceEntity(ArrivalEntity):
             if not requests.is_empty():
                 work.heritage = requests.of_request(
                     sender_of(header), header.request_id.sequence_number, header.source_timestamp)
+                if work.heritage is not None:
+                    work.then = partial(self._answer, header)
             engine.posted(work, now)
+
+
+    def _answer(self, header: Any, response: Any) -> None:
+        """Send a response, which the calling thread takes as well."""
+        self.rclpy_object.send_response(response, header)
+        self.rooms.pool.engine.sent_requests.receive_responses()
 
 
 class ClientEntity(ArrivalEntity):
@@ -347,6 +374,13 @@ class ClientEntity(ArrivalEntity):
         """Let the spinning thread collect responses."""
         self._take = compat.response_taker(self.rclpy_object)
         self.listen_in(rooms, rooms.at_once.loop)
+        rooms.pool.engine.sent_requests.add_receiver(self.handle, self.collect)
+
+    def ignore(self) -> None:
+        """End ``listen``."""
+        if self.fd >= 0:
+            self.rooms.pool.engine.sent_requests.remove_receiver(self.handle, self.collect)
+        super().ignore()
 
     def post(self, taken: Any) -> None:
         """Complete the future of a response."""

@@ -91,6 +91,21 @@ class WaitableEntity(AskedEntity):
 
     __slots__ = ()
 
+    def listen(self, rooms: Rooms) -> None:
+        """Let it be asked when one of its parts has announced an arrival."""
+        super().listen(rooms)
+        key = compat.receiver_of(self.rclpy_object)
+        if key is not None and self._source is not None:
+            rooms.pool.engine.sent_requests.add_receiver(key, self._source.ask_now)
+
+    def ignore(self) -> None:
+        """End ``listen``."""
+        rooms, source = self._rooms, self._source
+        key = compat.receiver_of(self.rclpy_object)
+        if key is not None and rooms is not None and source is not None:
+            rooms.pool.engine.sent_requests.remove_receiver(key, source.ask_now)
+        super().ignore()
+
 
 class GuardEntity(AskedEntity):
     """A guard condition of a node."""
@@ -270,6 +285,11 @@ class WaitableSource(ChannelSource):
     def collect(self) -> None:
         """Collect the arrivals soon: without the engine's lock, as this calls foreign code."""
         self._pool.unlocked_calls.append(self._ask)
+
+    def ask_now(self) -> None:
+        """Collect what has just been sent in the thread that calls."""
+        if self._pool.running and not self._pool.is_inside():
+            self._ask()
 
     def _ask(self) -> None:
         self._has_more = True

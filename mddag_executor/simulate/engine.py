@@ -25,10 +25,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from mddag_executor.core.inheritance import inherit
 from mddag_executor.core.jobs import finish, give_up, is_miss, release_job
 from mddag_executor.core.overload import admit
 from mddag_executor.core.policies import KeyFunction
-from mddag_executor.core.inheritance import inherit
 from mddag_executor.core.rules import complete, make_ready, ready_undeclared
 from mddag_executor.core.state import (
     add_slot,
