@@ -86,7 +86,7 @@ def of(file, *names):
 
 UNNOTICED = """\
 with self._pool.lock:
-                self._engine.ready(work, self._pool.tick())"""
+                self._engine.posted(work, self._pool.tick())"""
 """A task is ready, and no thread is woken."""
 
 CASES = [
@@ -100,7 +100,7 @@ def run(self, must_check: bool = True) -> Any:
             f'test_each_of_many_runs_once[spin-of_{kind}]' for kind in (
                 'tasks', 'subscriptions', 'services', 'guards', 'waitables'))), every=True),
     Case('create_task_does_not_wake_spin_once', [
-        ('executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED),
+        ('executor/executor.py', 'self._pool.report(self._engine.posted, work)', UNNOTICED),
         ('executor/executor.py', """\
 may not check
             self._at_once.ring()""", 'may not check\n            pass')], of(
@@ -179,7 +179,7 @@ client.completed = getattr(client, 'completed', 0) + 1
             ('sources', 'self.rooms.pool.fail(error)'), ('waitables', 'self._pool.fail(error)'))],
         of('test_spin.py', 'test_an_exception_comes_out_of_spin[take]'), at_once=True),
     Case('create_task_does_not_wake_workers', [(
-        'executor/executor.py', 'self._pool.report(self._engine.ready, work)', UNNOTICED)], of(
+        'executor/executor.py', 'self._pool.report(self._engine.posted, work)', UNNOTICED)], of(
         'test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
     Case('rest_not_collected', [(
         'executor/sources.py', 'self.collect_more = partial(self.collect, MANY)', 'pass')], of(
