@@ -23,11 +23,16 @@ from rclpy.task import Task
 
 
 class NodeHolder(BareExecutor):
-    """The executor of the nodes of a run; ``task_entity`` is what the run keeps for tasks."""
+    """
+    The executor of the nodes of a run.
+
+    :ivar task_entities: what the run keeps for tasks, and for those that inherit, which do not
+        wait behind the others.
+    """
 
     def __init__(self, context: Any, loop: Loop) -> None:
         super().__init__(context=context)
-        self.task_entity = TaskEntity()
+        self.task_entities = (TaskEntity(), TaskEntity())
         self._loop = loop
         self._unclaimed = Unclaimed(lambda error: None)  # none is kept
 
@@ -47,9 +52,11 @@ class NodeHolder(BareExecutor):
         def resume(work: Work) -> None:
             loop.call_in_run(lambda: loop.engine.resume(work, loop.now))
 
+        heritage = heritage_of_response(args) or loop.heritage(of_task=True)
+        entity = self.task_entities[heritage is not None]
         task, work = make_task(
-            self.task_entity, self, resume, self._unclaimed, None, callback, args, kwargs)
-        work.heritage = heritage_of_response(args) or loop.heritage(of_task=True)
+            entity, self, resume, self._unclaimed, None, callback, args, kwargs)
+        work.heritage = heritage
         loop.call_in_run(lambda: loop.engine.posted(work, loop.now))
         return task
 

@@ -169,7 +169,7 @@ class Rerun:
                 writer.path, task_set, self.policy, self._workers, DEFAULT_DEADLINE_NS,
                 MAX_ACTIVE_JOBS, clock, writer, self.cpus or 0,
                 on_late=engine.on_late)
-            self._recorder.entities((), [self._holder.task_entity])
+            self._recorder.entities((), self._holder.task_entities)
         self._registry = Registry(task_set, engine, engine.leave_group, self._recorder)
         self._messages = Messages(loop, recording, self.times, self._outputs, clock)
         self._requests = Requests(loop, self._holder, self._registry)

@@ -4,7 +4,11 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import POLICIES, Scheduler, Tables
+from mddag_executor.core import NEVER, POLICIES, Scheduler, Tables
+from mddag_executor.core.queues import overtaking_pays
+from mddag_executor.simulate import Settings, START
+from mddag_executor.simulate.schedule import schedule
+from mddag_executor.simulate.workload import Workload
 import pytest
 
 from ..conftest import examples
@@ -206,7 +210,6 @@ def test_only_times_are_inherited(policy):
 
 def test_what_inherits_may_overtake_as_what_it_inherits_from():
     """A wait of ten ticks is long for a deadline of 20 ticks, and short for the default one."""
-    from mddag_executor.core.queues import overtaking_pays
     core = new_core(default=10 ** 9)
     source = sender(core)
     request = core.ready_undeclared(0, -1, 0, core.new_queue(), 1)
@@ -214,3 +217,16 @@ def test_what_inherits_may_overtake_as_what_it_inherits_from():
     assert not overtaking_pays(core.tables, core.state, request, 0, wait, False)
     core.inherit(request, *core.heritage(source))
     assert overtaking_pays(core.tables, core.state, request, 0, wait, False)
+
+
+@pytest.mark.parametrize('compiled', [False, True])
+def test_a_simulated_request_goes_before_what_is_less_urgent(compiled):
+    """Three undeclared executions wait for a worker; the last one inherits a deadline."""
+    load = Workload(
+        times=[0, 1, 2, 3], dags=[0, 2, 2, 2], jobs=[0, 0, 1, 2], costs=[10, 5, 5, 5],
+        cost_base=[0, 0, 1], cost_stride=[0, 0, 1], inherited=[NEVER, NEVER, 20 * TICK],
+        inherits_from=[0, 0, 0])
+    settings = Settings(policy='rad', workers=1, duration_ns=100, preemptive=False)
+    run = schedule(Tables.build(TASK_SET), load, settings, log=True, compiled=compiled)
+    log = [[int(value) for value in row] for row in run.log]
+    assert [row[5] for row in log if row[1] == START and row[3] == 2] == [2, 0, 1]

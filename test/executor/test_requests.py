@@ -6,6 +6,10 @@ import inspect
 import threading
 import time
 
+from mddag_executor.core import NEVER, Tables
+from mddag_executor.executor.bounds import MOST
+from mddag_executor.sources.open import open_recording
+from mddag_executor.whatif.load import LoadBuilder
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionClient, ActionServer
@@ -16,6 +20,7 @@ from test_msgs.action import Fibonacci
 
 from .conftest import matched, Spinning, wait_for
 from .declared import graph
+from .inside import engine_of
 
 # the default deadline is ten times as long, and nothing depends on the speed of the machine
 URGENT = graph(urgent='name: control, subscription: /go, period: 30s, deadline: 30s')
@@ -244,10 +249,6 @@ def test_an_action_is_as_urgent_as_its_client(make_executor, make_node):
 
 def test_requests_are_forgotten(make_executor, make_node):
     """Also those that are not answered."""
-    from mddag_executor.executor.bounds import MOST
-
-    from .inside import engine_of
-
     async def ask(each):
         for _ in range(20 * MOST):
             each.request('silent')
@@ -260,3 +261,24 @@ def test_requests_are_forgotten(make_executor, make_node):
     each.clients['silent'].wait_for_service = lambda timeout: True
     each.run()
     assert len(engine_of(each.executor).sent_requests._notes) <= 4 * MOST
+
+
+def test_a_recording_says_what_a_request_has_inherited(make_executor, make_node, tmp_path):
+    """And its load as well, for rescheduling."""
+    path = tmp_path / 'run.mcap'
+    each = Asking(make_executor, make_node, await_answer, trace=path)
+    each.serve('ask')
+    each.run()
+    each.executor.shutdown()
+    recording = open_recording(path)
+    table = recording.executions
+    inherits = table['inherited'] > 0
+    assert [recording.callback_name(callback) for callback in table['callback'][inherits].tolist()
+            ] == ['/serving: answer (service /ask)']
+    deadline = int(recording.jobs.release[0]) + 30 * 10 ** 9
+    assert table['inherited'][inherits].tolist() == [deadline]
+    assert not inherits[table['vertex'] >= 0].any()
+    load = LoadBuilder(recording, Tables.build(recording.task_set), 1).build().load
+    inherited = [*map(int, load.inherited)]
+    assert sorted(inherited)[:2] == [deadline, NEVER]
+    assert load.inherits_from[inherited.index(deadline)] == 0

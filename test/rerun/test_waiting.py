@@ -63,6 +63,29 @@ def test_a_service_answers_in_virtual_time(bag, graph):
     assert not result.warnings
 
 
+@pytest.mark.parametrize('declared', [True, False])
+def test_a_request_of_a_callback_with_a_deadline_is_as_urgent(bag, graph, declared):
+    """It goes before tasks that wait already; the callback of its response does as well."""
+    def ask(node):
+        for _ in range(3):
+            node.executor.create_task(node.note, 'task')
+        node.client.call_async(Trigger.Request()).add_done_callback(lambda _: node.note('hello'))
+
+    def take(node, number):
+        if number == 3:
+            if declared:
+                ask(node)
+            else:
+                node.executor.create_task(ask, node)
+
+    def fill(node):
+        node.client = node.create_client(Trigger, '/greet')
+
+    seen, _ = run_filter(bag, graph, take, lambda: server(0), workers=1, fill=fill)
+    order = [text for _, text in seen]
+    assert order == (['hello', *['task'] * 3] if declared else [*['task'] * 3, 'hello'])
+
+
 def test_services_of_later_programs_are_waited_for_without_delay(bag, graph):
     seen = []
 
