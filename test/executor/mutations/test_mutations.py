@@ -178,6 +178,15 @@ client.completed = getattr(client, 'completed', 0) + 1
         (f'executor/{file}.py', text, 'pass') for file, text in (
             ('sources', 'self.rooms.pool.fail(error)'), ('waitables', 'self._pool.fail(error)'))],
         of('test_spin.py', 'test_an_exception_comes_out_of_spin[take]'), at_once=True),
+    Case('requests_inherit_nothing', [(
+        'executor/engine.py', 'self._end_bypass().inherit(work.x, *work.heritage)', 'pass')], of(
+        'test_requests.py', 'test_a_service_goes_before_what_is_less_urgent_than_its_client[spin]',
+        'test_an_action_is_as_urgent_as_its_client')),
+    Case('urgent_requests_wait_for_the_next_look', [(
+        'executor/sent_requests.py', 'receive()', 'pass')], of(
+        'test_requests.py', 'test_a_service_that_asks_another_one_passes_it_on',
+        'test_the_callback_of_a_response_is_as_urgent',
+        'test_an_action_is_as_urgent_as_its_client')),
     Case('create_task_does_not_wake_workers', [(
         'executor/executor.py', 'self._pool.report(self._engine.posted, work)', UNNOTICED)], of(
         'test_executor.py', 'test_tasks_nodes_and_entities_wake_an_idle_executor[spin]')),
