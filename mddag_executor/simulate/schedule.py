@@ -119,12 +119,14 @@ class Scheduled(NamedTuple):
     ) -> None:
         """Count the jobs and decisions of a compiled run."""
         import numpy as np
-        times, dags, released = map(np.asarray, (load.times, load.dags, releases))
-        judged = (times <= self.ended) & (times < settings.duration_ns) & (
-            released >= settings.judge_from) & (released < settings.judge_until) & (
-            dags < len(tally.jobs))
-        tally.jobs = np.bincount(
-            dags[judged].astype(np.int64), minlength=len(tally.jobs)).tolist()
+        every = tuple(map(np.asarray, (load.times, load.dags, releases)))
+        jobs = np.zeros(len(tally.jobs) + 1, dtype=np.int64)
+        for first in range(0, len(every[0]), _PART):
+            times, dags, released = (column[first:first + _PART] for column in every)
+            judged = (times <= self.ended) & (times < settings.duration_ns) & (
+                released >= settings.judge_from) & (released < settings.judge_until)
+            jobs += np.bincount(dags[judged].astype(np.int64), minlength=len(jobs))
+        tally.jobs = jobs[:-1].tolist()     # without those of undeclared callbacks
         decisions = np.asarray(self.decisions, dtype=np.int64).reshape(-1, 6)
         tally.add_results(_results(decisions))
         tally.add(decisions[decisions[:, 0] == SINK_DEMOTED].tolist())

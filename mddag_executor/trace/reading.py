@@ -373,7 +373,7 @@ class Reading:
                     add(content)
                 except ValueError as error:
                     what = str(error)
-            elif opcode == 0:
+            elif opcode <= Opcode.DATA_END:     # 0, or a record that is never in a chunk
                 what = 'a record is where it cannot be'
             else:
                 others += 1

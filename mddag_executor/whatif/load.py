@@ -139,8 +139,9 @@ class LoadBuilder:
         self._skipped: set[tuple[int, int]] = set()
         jobs = recording.jobs
         of_dag = [jobs.of_dag(dag.index) for dag in task_set.dags]
-        # by DAG: the recorded numbers of its jobs
-        self._numbers = [jobs.number[mine] for mine in of_dag]
+        # by DAG: the recorded numbers of its jobs; they are kept, so in little memory
+        kind: Any = np.int32 if jobs.number.max(initial=0) < 2 ** 31 else np.int64
+        self._numbers = [jobs.number[mine].astype(kind) for mine in of_dag]
         # by kind of column and DAG: the values of each job, and where they begin
         self._widths = np.array(
             [(1, len(dag.vertices), len(edges)) for dag, edges in zip(
@@ -547,8 +548,9 @@ class LoadBuilder:
         del ready
         columns.append(np.repeat(np.arange(n_dags + 1), counts)[order])
         columns.append(np.concatenate([np.arange(count) for count in counts])[order])
+        released = np.concatenate([*releases, others])[order]
         columns += [costs, self._begins[_VERTEX].tolist(), [*self._widths[_VERTEX].tolist(), 1],
-                    np.concatenate([*releases, others])[order]]
+                    [] if np.array_equal(released, columns[0]) else released]
         return Workload(*columns)
 
     def _transports(self, overheads: bool, process: Sequence[int]) -> tuple[Any, int | None]:

@@ -320,7 +320,7 @@ def hostile():
     }
 
 
-ODD_BUT_SOUND = {'chunks of a message', 'a chunk in a chunk', 'a row of empty records'}
+ODD_BUT_SOUND = {'chunks of a message', 'a row of empty records'}
 
 READ_ALL = """
 import resource, sys, time
