@@ -841,10 +841,14 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Judge jobs that are released from now on, or none until the next call.
 
+        All entities that its nodes have by then are known when that begins.
+
         :param since: the time to judge from (monotonic ns); None: now.
         """
         if since is not None:
             since += self._trace_clock.offset_ns
+        if judging:
+            self._upkeep.refresh()
         self._pool.report(self._engine.set_judging, judging, since)
 
     def unmatched(self) -> list[str]:

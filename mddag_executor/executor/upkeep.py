@@ -77,12 +77,12 @@ class Upkeep:
         with self._lock:
             if not self.changed:
                 return
-            start = time.monotonic()
+            start = time.thread_time()  # a refresh takes longer while the machine is busy
             self.changed = False
             self._refresh()
             self._pool.is_current = not self.changed  # it may have changed meanwhile
-            end = time.monotonic()
-            self._refresh_at = end + 3 * (end - start)  # for a quarter of the time at most
+            # for a quarter of the time at most
+            self._refresh_at = time.monotonic() + 3 * (time.thread_time() - start)
 
     def stop_listening(self) -> None:
         """

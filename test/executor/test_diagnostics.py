@@ -285,6 +285,20 @@ def test_what_ran_only_before_the_begin_is_said(make_executor, make_node):
             '/bringup:start') in lines
 
 
+def test_all_callbacks_are_known_when_judging_begins(make_executor, make_node):
+    """On a busy machine a node that has just been added is noticed only some time later."""
+    executor = make_executor(loads(graph(eye='name: see, timer: 20ms, deadline: 1s')))
+    executor.set_judging(False)
+    with Spinning(executor):
+        assert wait_for(lambda: not executor._upkeep.changed)
+        executor._upkeep._refresh_at = time.monotonic() + 1000.0
+        node = make_node('eye')
+        node.create_timer(0.02, lambda: None)
+        executor.add_node(node)
+        executor.set_judging(True)
+        assert executor._registry.hosted() == {'/eye:see'}
+
+
 CAMERA = graph(
     camera='name: capture, timer: 50ms, publishes: [/image], dag: vision',
     detector='name: detect, subscription: /image, deadline: 50ms')
