@@ -13,10 +13,11 @@ Theory of operation
    does not show: deadline, queue edges, period, sync, group, name of the DAG, and topics that
    nothing published.  Other callbacks are named by their recorded function, otherwise
    ``callback_0``, ``callback_1``, … by node, in the order of creation.
-4. A topic of a node is published by the callbacks that were seen to publish it. If none was, every
-   callback of the node may publish it; for a node without callbacks a timer is assumed.  If each
-   subscription received at most one message, the topic is latched: the node published it when it
-   was made, and its subscribers are sporadic sources.
+4. A topic of a node is published by the callbacks that were seen to publish it. If none was, but
+   messages of it were received, no callback publishes it: the node does so when it is made, or in
+   a thread of its own.  Its subscribers are sources, and sporadic if they got at most one message.
+   If none were received, every callback of the node may publish it; for a node without callbacks
+   a timer is assumed.
 5. A service without calls, and a subscription without messages whose topic no callback publishes,
    have no rate, so they cannot be the source of a DAG.  They are left out and reported.
 6. A timer that was made after another one of its node, with the same period and function, had
@@ -243,12 +244,14 @@ class System:
             callback = self._callback(entity, node)
             node.callbacks.setdefault(callback.name, callback)
         self._keep_declared_topics(nodes)
-        latched = self._latched(nodes)
+        received = {topic for node in nodes.values() for callback in node.callbacks.values()
+                    if callback.kind == 'subscription' and callback.runs
+                    for topic in callback.started_by}
         for name, topics in self._publishers.items():
             drafted = nodes[name].callbacks if name in nodes else {}
             known = {topic for each in drafted.values() for topic in each.publishes}
             unseen = [t for t, seen in topics.items() if not seen and t not in known
-                      and t not in latched
+                      and t not in received
                       and not is_side_output(t, name) and TOPIC.fits(t)]
             if unseen and not drafted and NODE.fits(name):
                 timer = DraftCallback(name, 'callback_0', 'timer')
@@ -272,15 +275,6 @@ class System:
             'it never fired, so it was cancelled, or reset each time before')
         draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
         return draft
-
-    @staticmethod
-    def _latched(nodes: dict[str, DraftNode]) -> set[str]:
-        """Return the topics that no subscription received more than once (rule 4)."""
-        every = [callback for node in nodes.values() for callback in node.callbacks.values()
-                 if callback.kind == 'subscription' and callback.runs]
-        once = {topic for each in every if each.came_once for topic in each.started_by}
-        return once.difference(
-            topic for each in every if not each.came_once for topic in each.started_by)
 
     def _keep_declared_topics(self, nodes: dict[str, DraftNode]) -> None:
         """Keep declared topics that no callback has published: the recording may be too short."""

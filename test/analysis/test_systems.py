@@ -189,6 +189,29 @@ def test_what_comes_when_it_is_needed_is_sporadic(tmp_path):
         '/plan', 1_000 * MS, True, 1_000 * MS)
 
 
+def test_what_a_thread_of_a_node_publishes_comes_from_no_callback(tmp_path):
+    """A main loop that sleeps with a Rate, for instance: its subscriber is a source."""
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(100, '/lidar')
+    r.node(300, '/stop')
+    r.publisher(110, 100, '/scan')
+    r.publisher(120, 100, '/unheard')
+    r.timer(1, 100, 50 * MS)
+    r.subscription(230, 300, '/scan')
+    for k in range(20):
+        ran(r, 1, 1, 1_000 * MS + 50 * MS * k, MS)
+        ran(r, 230, 3, 1_002 * MS + 100 * MS * k, MS)
+    system = System(r.write())
+    text = declaration_of(system.draft())
+    assert '# publishes: [/unheard]' in text and text.count('/scan') == 1
+    draft = system.draft()
+    accept(draft)
+    tick, scan = loads(declaration_of(draft, accepted=True)).callbacks
+    assert (scan.topics, scan.period_ns, scan.sporadic, scan.deadline_ns) == (
+        ('/scan',), 100 * MS, False, 100 * MS)
+    assert (tick.publishes, draft.left_out) == ((), [])
+
+
 def test_what_is_no_system(tmp_path):
     r = Recorded(tmp_path / 'e.mcap')
     r.run(5, 1, 1, 2)
