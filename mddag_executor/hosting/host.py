@@ -730,7 +730,7 @@ def nodes_of(
         for guest in host.guests:
             if not guest.nodes:
                 raise LoadingError(
-                    guest.program.spec, f'it has made no node in {START_TIMEOUT_S:g} s, so its '
+                    guest.program.spec, f'it has spun no node in {START_TIMEOUT_S:g} s, so its '
                     'process is unknown', f'name the process: PROCESS={guest.program.spec}')
         then([[n.get_fully_qualified_name() for n in guest.nodes] for guest in host.guests])
 
