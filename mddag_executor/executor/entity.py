@@ -187,16 +187,16 @@ class Entity(ChannelSource):
         """Return whether none of its executions waits or runs."""
         return self.ready <= self.ran + self.dropped
 
-    def count_into(self, counts: dict[str, dict[str, Any]]) -> None:
+    def count_into(self, counts: dict[str, dict[str, Any]], name: str | None = None) -> None:
         """
-        Add the counts of this entity to those of its callback.
+        Add the counts of this entity to those of its callback, or to those of a name.
 
         Unused entities (the many services and events of every node) are left out.
         """
         if self.callback is None and not self.ready + self.skipped + self.dropped:
             return
         share = self.habit.share
-        add_counts(counts, self.name, {
+        add_counts(counts, name or self.name, {
             'kind': self.kind, 'declared': self.callback is not None,
             'waiting': len(self.waiting), 'holds_interpreter': bool(self.habit.holds),
             'interpreter_share': None if share is None else round(share, 3),

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple, TypeVar
 import weakref
 
 from mddag_executor.executor.bindings import Bindings
+from mddag_executor.executor.bounds import REMEMBERED
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import COUNTS
 from mddag_executor.executor.groups import CallbackGroups
@@ -61,6 +62,9 @@ KINDS: tuple[type[Kind], ...] = (
 
 LISTS = tuple(dict.fromkeys(kind.list_name for kind in KINDS))
 """The properties of a node that list its entities."""
+
+OTHERS = 'other destroyed callbacks'
+"""The name for the counts of undeclared callbacks that are gone, after ``REMEMBERED`` names."""
 
 EntitySet = dict[Node, tuple[list[Any], ...]]
 """The entities of each node, for each of ``LISTS``, in the order of creation."""
@@ -234,10 +238,17 @@ class Registry:
         retired, self._retired = self._retired, []
         for entity in retired:
             if entity.is_through():
-                entity.count_into(self._past)
+                entity.count_into(self._past, self._name_to_keep(entity))
                 self.bindings.note_received(entity)
             else:
                 self._retired.append(entity)
+
+    def _name_to_keep(self, entity: Kind) -> str | None:
+        """Return the name for the counts of a retired entity; None: its own."""
+        if entity.callback is None and len(self._past) >= REMEMBERED and (
+                entity.name not in self._past):
+            return OTHERS
+        return None
 
     def counts(self) -> dict[str, dict[str, Any]]:
         """Return the counts of all entities, also removed ones, by callback (see ``Entity``)."""

@@ -14,6 +14,7 @@ import weakref
 
 from mddag_executor.core.state import State
 from mddag_executor.executor import publishing, waitables
+from mddag_executor.executor.registry import OTHERS
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -269,6 +270,24 @@ def test_nodes_that_come_and_go_leave_nothing_behind(make_executor, ros_context)
         assert wait_for(lambda: not left()), left()
     ran = executor.statistics()['callbacks']['/sink:heard']['ran']
     assert ran == sum(map(len, heard))
+
+
+def test_names_of_destroyed_callbacks_are_kept_up_to_a_bound(
+        make_executor, make_node, monkeypatch):
+    """A helper node with a random name, for instance, that each request makes."""
+    monkeypatch.setattr('mddag_executor.executor.registry.REMEMBERED', 2)
+    executor, ran = make_executor(), []
+    for number in range(5):
+        node = make_node(f'helper_{number}')
+        timer = node.create_timer(0.001, lambda number=number: ran.append(number))
+        executor.add_node(node)
+        assert wait_for(lambda number=number: executor.spin_once(1.0) or number in ran)
+        node.destroy_timer(timer)
+        executor.remove_node(node)
+        executor.spin_once(0)
+    counts = executor.statistics()['callbacks']
+    assert sum(each['ran'] for each in counts.values()) == len(ran) >= 5
+    assert len(counts) == 3 and counts[OTHERS]['ran'] >= 3
 
 
 def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_context):
