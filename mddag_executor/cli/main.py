@@ -81,6 +81,9 @@ def find_verb(argv: Sequence[str]) -> tuple[Parser, Sequence[str]]:
     if verb in REMOVED:
         raise UsageError(f'mddag {verb}: there is no such verb any more: {REMOVED[verb]}')
     if verb not in VERBS:
+        whole = next((each for each in VERBS if each.endswith(f' {word}')), None)
+        if not family and whole is not None:
+            raise UsageError(f"{prog}: there is no verb '{word}': did you mean '{whole}'?")
         known = (each.removeprefix(f'{family} ') for each in VERBS)
         raise unknown(prog, 'verb', word, [each for each in known if ' ' not in each]
                       + ([] if family else sorted(_FAMILIES)))
