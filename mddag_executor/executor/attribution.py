@@ -154,16 +154,19 @@ class PublisherState:
     :ivar is_tracked: whether a declared callback has published a trigger topic with it, which
         starts the counting of its publications.
     :ivar sending: the publication that is being sent.
+    :ivar recorded_by: the number of the recorder that has last recorded it; 0: none.
     :ivar lock: serialises the publications of a trigger topic; reentrant, as a signal handler may
         publish in the thread that owns it.
     """
 
-    __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked', 'sending', 'address')
+    __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked', 'sending', 'address',
+                 'recorded_by')
 
     def __init__(self, topic: str) -> None:
         self.lock = threading.RLock()
         self.topic = topic
         self.address = new_address()
+        self.recorded_by = 0
         self.count = 0
         self.numbers = PublisherNumbers()
         self.is_tracked = False

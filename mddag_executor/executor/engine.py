@@ -35,7 +35,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 from threading import get_native_id
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol, TYPE_CHECKING
 
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.deadlines import Deadlines
@@ -55,7 +55,13 @@ from mddag_executor.core.state import (
     WAITING,
 )
 from mddag_executor.executor.answers import Answers, open_release
-from mddag_executor.executor.attribution import Announced, Attribution, NO_ORIGIN, Origin
+from mddag_executor.executor.attribution import (
+    Announced,
+    Attribution,
+    NO_ORIGIN,
+    Origin,
+    PublisherState,
+)
 from mddag_executor.executor.bounds import NET_NS, SHORT_CALLBACK_NS
 from mddag_executor.executor.bypass import Bypass
 from mddag_executor.executor.entity import Entity
@@ -76,6 +82,19 @@ if TYPE_CHECKING:
 KEEP_STEPS = 100
 MOST_MISSED = 1000
 """After a long stop (a suspended machine) at most this many releases are judged one by one."""
+
+
+class PublisherRecorder(Protocol):
+    """
+    Records publishers: see ``recorder.Recorder``.
+
+    :ivar number: its own, from 1 up.
+    """
+
+    number: int
+
+    def publisher(self, publisher: Any, state: PublisherState) -> None:
+        """Record a publisher, unless that has been done."""
 
 
 class Step:
@@ -139,6 +158,8 @@ class Engine:
         self.dag_names = [d.name for d in task_set.dags] if task_set else []
         self.n_workers = n_workers
         self.record = record
+        #: Records publishers that are used before they were noticed; None: nothing is recorded.
+        self.recorder: PublisherRecorder | None = None
         self._records = None if record is None else RunRecords(
             record, self.tables, self.scheduler.state)
         self.on_late = on_late
@@ -855,12 +876,16 @@ class Engine:
         self.ask_again()
 
     def publishes(
-        self, work: Work | None, topic: str, address: int, message: Any, now: int, vtid: int
+        self, work: Work | None, publisher: Any, state: PublisherState, message: Any, now: int,
+        vtid: int,
     ) -> None:
         """Note that a callback publishes, while ``notes_publications``; without the lock."""
         if self._records is not None:
-            self._records.publication(address, message, now, vtid)
-        if work is not None and self.path_watch is not None and topic in self.path_watch.topics:
+            if self.recorder is not None and state.recorded_by != self.recorder.number:
+                self.recorder.publisher(publisher, state)
+            self._records.publication(state.address, message, now, vtid)
+        topic, watch = state.topic, self.path_watch
+        if work is not None and watch is not None and topic in watch.topics:
             work.sent += (topic, now),
 
     def job_of(self, work: Work) -> tuple[str, int, int] | None:

@@ -206,6 +206,7 @@ class MultiDeadlineExecutor(BareExecutor):
         try:
             self._pool = WorkerPool(self._engine, self._trace_clock, fail, prepare)
             if self._recorder is not None:
+                self._engine.recorder = self._recorder
                 self._recorder.writer.before_write = LongRuns(self._pool).note
             self._at_once = AtOnce(self._pool)
             self._signals = SignalPipe()

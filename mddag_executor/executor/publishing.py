@@ -170,7 +170,7 @@ def _send(
     """Publish; return the publication if a callback published on a trigger topic."""
     topic = None
     if running is not None:
-        running.publishes(state, msg)
+        running.publishes(publisher, state, msg)
         topic = running.engine.attribution.topics.get(state.topic)
     if running is not None and topic is None and not state.is_tracked:
         original(publisher, msg)

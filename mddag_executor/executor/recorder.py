@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import count
 import socket
 import threading
 from typing import Any
@@ -13,6 +14,7 @@ import weakref
 from mddag_executor import defaults
 from mddag_executor.clocks import boot, TraceClock
 from mddag_executor.core.tables import ON_LATE
+from mddag_executor.executor.attribution import PublisherState
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.publishing import state_of
 from mddag_executor.trace.errors import TraceError
@@ -20,6 +22,8 @@ from msg_graph import TaskSet
 from rclpy.exceptions import InvalidHandle
 from rclpy.logging import get_logger
 from rclpy.utilities import get_rmw_implementation_identifier
+
+_numbers = count(1)
 
 
 class Recorder:
@@ -32,6 +36,7 @@ class Recorder:
     :param writer: writes the file, as a ``TraceWriter``; None: one that does not block.
     :param overwrite: whether an existing file may be replaced.
     :param cpus: their number, 0: unknown; None: the machine's.
+    :ivar number: its own, from 1 up.
     :raises mddag_executor.trace.TraceError: when the file cannot be written.
     """
 
@@ -49,6 +54,8 @@ class Recorder:
         self._clock = clock
         # the objects themselves: an address may be used again
         self._known: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._nodes: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()
+        self.number = next(_numbers)
         self._say(
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
             policy, workers, default_deadline, max_active_jobs, False,
@@ -88,14 +95,34 @@ class Recorder:
         address = id(node)
         if node not in self._known:
             self._known.add(node)
+            self._nodes[address] = node
             self._say('rcl_node_init', address, address, node.get_name(), node.get_namespace())
         for publisher in list(node.publishers):
-            if publisher not in self._known:
-                self._known.add(publisher)
-                handle = state_of(publisher).address
-                self._say(
-                    'rcl_publisher_init', handle, address, handle,
-                    publisher.topic_name, publisher.qos_profile.depth)
+            self._publisher(publisher, state_of(publisher), address)
+
+    def publisher(self, publisher: Any, state: PublisherState) -> None:
+        """
+        Record a publisher that is used before its node was found to have it.
+
+        A callback may make it, use it and destroy it; or its node belongs to no executor.
+        """
+        nodes = (ref() for ref in self._nodes.valuerefs())
+        node = next((each for each in nodes
+                     if each is not None and publisher in list(each.publishers)), None)
+        if node is not None:
+            self._publisher(publisher, state, id(node))
+        else:  # once more when its node is recorded
+            self._say_publisher(publisher, state, 0)
+
+    def _publisher(self, publisher: Any, state: PublisherState, node: int) -> None:
+        if publisher not in self._known:
+            self._known.add(publisher)
+            self._say_publisher(publisher, state, node)
+
+    def _say_publisher(self, publisher: Any, state: PublisherState, node: int) -> None:
+        state.recorded_by = self.number
+        self._say('rcl_publisher_init', state.address, node, state.address,
+                  publisher.topic_name, publisher.qos_profile.depth)
 
     def _entity(self, entity: Entity, node: int) -> None:
         entity.record(self._say, node)

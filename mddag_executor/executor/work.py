@@ -46,7 +46,7 @@ class Runner(Protocol):
     def job(self) -> tuple[str, int, int] | None:
         """Return DAG, index and release of its job."""
 
-    def publishes(self, state: Any, msg: Any) -> None:
+    def publishes(self, publisher: Any, state: Any, msg: Any) -> None:
         """Note that the callback publishes."""
 
     def lend(self, waits_for: str = '') -> AbstractContextManager[Any]:

@@ -173,6 +173,8 @@ class Messages:
         if outlet is None:
             outlet = self._outlets[publisher] = Outlet(publisher)
             self._loop.changed = True   # it may be new: it is recorded with its node
+            if self._engine.recorder is not None:   # or at once, as it may be destroyed before
+                self._engine.recorder.publisher(publisher, outlet.state)
         return outlet
 
     # --- questions about the ROS graph -----------------------------------------------------------

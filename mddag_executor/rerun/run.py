@@ -170,6 +170,7 @@ class Rerun:
                 MAX_ACTIVE_JOBS, clock, writer, self.cpus or 0,
                 on_late=engine.on_late)
             self._recorder.entities((), self._holder.task_entities)
+            engine.recorder = self._recorder
         self._registry = Registry(task_set, engine, engine.leave_group, self._recorder)
         self._messages = Messages(loop, recording, self.times, self._outputs, clock)
         self._requests = Requests(loop, self._holder, self._registry)

@@ -92,6 +92,35 @@ def test_entities_may_come_and_go_while_recorded(make_executor, make_node, tmp_p
             for row in run.publications} == {('/a:step', '/left'), ('/a:tick', '/right')}
 
 
+def test_a_publisher_that_is_noticed_too_late_is_recorded(make_executor, make_node, tmp_path):
+    """A callback makes it, uses it and destroys it; or its node belongs to no executor."""
+    path = tmp_path / 'live.mcap'
+    text = graph(eye='name: see, timer: 20ms, may_publish: [/seen]',
+                 hand='name: act, subscription: /seen, deadline: 1s')
+    eye, hand, published, heard = make_node('eye'), make_node('hand'), [], []
+    other = make_node('helper').create_publisher(Header, '/seen', 10)
+
+    def see():
+        published.append(1)
+        if len(published) % 2:
+            other.publish(Header())
+        else:
+            brief = eye.create_publisher(Header, '/seen', 10)
+            brief.publish(Header())
+            eye.destroy_publisher(brief)
+
+    eye.create_timer(0.02, see)
+    hand.create_subscription(Header, '/seen', heard.append, 10)
+    executor = make_executor(loads(text), nodes=[eye, hand], trace=str(path))
+    with Spinning(executor):
+        assert wait_for(lambda: len(heard) >= 10)
+    live = executor.statistics()['dags']['/eye']['sinks']['/hand:act']
+    found = replay(path).result()['dags']['/eye']['sinks']['/hand:act']
+    assert live['completed'] >= 10
+    assert [found.get(key) for key in ('completed', 'not_due')] == [
+        live.get(key) for key in ('completed', 'not_due')]
+
+
 def test_an_undeclared_coroutine_is_one_execution_however_often_it_is_resumed(
         make_executor, tmp_path):
     path = tmp_path / 'live.mcap'
