@@ -192,6 +192,10 @@ def function_of(symbol: str) -> str | None:
     return None if found is None else found[1]
 
 
+OF_RATE = 'threading.Event.set'
+"""The function of the timer of a ``Rate``, which ends a thread's sleep."""
+
+
 def entity_name(node: str, symbol: str, what: str) -> str:
     """
     Return the name of an undeclared callback.
@@ -199,7 +203,7 @@ def entity_name(node: str, symbol: str, what: str) -> str:
     :param symbol: of its function; empty if there is none.
     :param what: its kind and start, as `timer 100ms`.
     """
-    function = function_of(symbol)
+    function = 'Rate' if symbol == OF_RATE else function_of(symbol)
     if not node:
         return f'{function or "callback"} ({what})'
     return f'{node}: {what}' if function is None else f'{node}: {function} ({what})'

@@ -48,7 +48,7 @@ from mddag_executor.recording.tables import VERTEX
 from mddag_executor.sources.open import open_to_draft, Traces
 from msg_graph import Callback as Declared
 from msg_graph import EMPTY_TASK_SET, ExecutionTime, TaskSet
-from msg_graph.binding import function_of, is_background, is_side_output
+from msg_graph.binding import function_of, is_background, is_side_output, OF_RATE
 from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath, leave_out_sources
 from msg_graph.duration import DAY, exact_duration
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
@@ -64,10 +64,9 @@ COPIED_SHARE = 0.9
 STORES_NS = 500_000
 """A callback that only stores its message takes no longer in nine of ten executions."""
 IRREGULAR = 3
+"""Times between executions are irregular if the 90 % quantile is this many times the 10 % one."""
 _LONG_NS = 2_000_000_000
 """One message in at least this time has no rate."""
-_OF_RATE = 'threading.Event.set'    # the callback of the timer of a ``Rate``
-"""Times between executions are irregular if the 90 % quantile is this many times the 10 % one."""
 ONCE_PERIODS = 3
 """A timer fires once if it was silent for this many periods after its only execution."""
 NEVER_PERIODS = 20
@@ -581,7 +580,7 @@ def _is_shown(entity: Callback) -> bool:
     if not NODE.fits(entity.node_name):
         return False
     if entity.kind == 'timer':
-        return entity.period >= 1_000 and entity.symbol != _OF_RATE
+        return entity.period >= 1_000 and entity.symbol != OF_RATE
     name = TOPIC if entity.kind == 'subscription' else SERVICE
     return not is_background(entity.start, entity.node_name) and name.fits(entity.start)
 

@@ -200,6 +200,7 @@ def test_a_rate_that_is_found_before_it_has_its_callback_ends_a_sleep(make_execu
         assert wait_for(lambda: len(ran) >= 3)
         assert all(running is not None for running in ran)
     assert len(slept) == 3
+    assert executor.statistics()['callbacks']['/node: Rate (timer 10ms)']['ran'] >= 3
 
 
 def test_one_slow_execution_does_not_make_a_callback_long(make_executor, monkeypatch):
