@@ -14,7 +14,7 @@ from mddag_executor.analysis.drift import drift_of
 from mddag_executor.analysis.explain import Explanation
 from mddag_executor.analysis.paths import Paths
 from mddag_executor.analysis.requirements import Requirements
-from mddag_executor.analysis.usage import group_waits, share, Usage
+from mddag_executor.analysis.usage import OtherWaits, share, Usage
 from mddag_executor.core import NEVER
 from mddag_executor.memory import give_back
 from mddag_executor.recording.columns import Table
@@ -93,8 +93,8 @@ class Replay:
         return Requirements(self.recording, self.paths, self.judged.judge_from)
 
     @cached_property
-    def _waited(self) -> Any:
-        return group_waits(self.recording)
+    def _waited(self) -> OtherWaits:
+        return OtherWaits.of(self.recording)
 
     def table(self, name: str) -> Table:
         """

@@ -13,8 +13,9 @@ along its critical chain (see ``chains``):
   timer or message; else *released late*;
 * ready callback: *group* while another callback of its group ran; else *program* while another
   callback of its program ran, if that runs them one at a time; else *waited* while all workers
-  were busy; else, with an idle worker, *interpreter* while any callback ran that may have held the
-  GIL (undeclared callbacks: unknown), *machine* while none ran;
+  were busy; else, with an idle worker, *interpreter* while any callback ran that held the GIL, or
+  may have held it because the trace does not say (undeclared callbacks in traces of version 2),
+  *machine* while none ran;
 * the time that a job *waited*, or waited for its *program* or the *interpreter*, after its
   demotion counts as *demoted*; or as *less important* if the job could still have been in time
   when it was demoted, so that it only made way for more important work;
@@ -54,7 +55,7 @@ from mddag_executor.analysis.spans import Spans
 from mddag_executor.core.state import SINK_ABORTED, SINK_EXPIRED, SINK_FAILED, SINK_LATE
 from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.columns import rows as table_of
-from mddag_executor.recording.joins import as_of, distinct
+from mddag_executor.recording.joins import as_of, distinct, equal_pairs
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
@@ -93,16 +94,17 @@ REMEDIES = {
                    'deadlines for the callbacks that publish them',
     'never ended': 'mend the callback that has not ended: give what it waits for (a service, a '
                    'lock, a future) a timeout'}
-_DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED}
+ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
+"""Causes for which a callback waited until a worker was free."""
+WAITS = (*ON_WORKERS, INTERPRETER, GROUP, NEVER_ENDED, PROGRAM)
+"""Causes for which a callback waited for others, which are named."""
+DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED}
 """By reason of a drop its cause; jobs are aborted because of an earlier miss: they *waited*."""
 NO_MESSAGE = (DROPPED, DESTROYED, NOT_PUBLISHED, LOST)
 """Causes for which a callback never ran."""
 HANGS_NS = 1_000_000_000
 _NOTHING_NS = 1_000_000
 _ABOUT_BITS = 4     # up to a 16th above the usual time is usual
-_ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
-_WAITS = (*_ON_WORKERS, INTERPRETER, GROUP, NEVER_ENDED, PROGRAM)
-_MOST_BEHIND = 5
 
 MISSED = np.dtype([
     ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
@@ -183,18 +185,6 @@ class Pool(NamedTuple):
         return covered
 
 
-class Members(NamedTuple):
-    """Which callbacks exclude each other, by vertex and by callback a number; -1: none."""
-
-    of_vertex: dict[int, int]
-    of_callback: dict[int, int]
-
-    def share(self, vertex: int, callback: int) -> bool:
-        """Return whether a vertex and a callback exclude each other."""
-        number = self.of_vertex.get(vertex, -1)
-        return number >= 0 and number == self.of_callback.get(callback, -1)
-
-
 class Usual(NamedTuple):
     """
     Usual times.
@@ -212,37 +202,47 @@ STARTED = np.dtype([
     ('vertex', 'i4'), ('leg', 'i2'), ('job', 'i8'), ('ready', 'i8'), ('start', 'i8'),
     ('group', 'i8')])
 """Columns of a started execution; ``group``: how long it waited for its callback group, ns."""
+DROPPED_RUNS = np.dtype([
+    ('vertex', 'i4'), ('job', 'i8'), ('time', 'i8'), ('cause', 'i8'), ('aborted', '?')])
+"""
+Columns of a dropped execution: when it was dropped, and the cause of the miss that follows;
+``aborted``: it was dropped with its job.
+"""
 
 
 class Never(NamedTuple):
     """
     What is known of executions that never ran.
 
-    :ivar dropped: by vertex and job why the execution was dropped, and when.
+    :ivar dropped: dropped executions, a table of ``DROPPED_RUNS``.
     :ivar dropped_at: by vertex when executions were dropped whose jobs are not recorded.
     :ivar started: executions that were started, a table of ``STARTED``.
-    :ivar unpublished: vertices and jobs whose message the callback before did not publish.
+    :ivar unpublished: by miss whether the callback before did not publish the message.
     """
 
-    dropped: dict[tuple[int, int], tuple[str, int]]
+    dropped: Table
     dropped_at: dict[int, Ints]
     started: Table
-    unpublished: set[tuple[int, int]]
+    unpublished: Mask
 
-    def why_dropped(self, key: tuple[int, int]) -> str | None:
-        """Return why the execution of a vertex and job was dropped; None: it was not."""
-        return self.dropped.get(key, (None, 0))[0]
+    def drops_of(self, vertex: Ints, job: Ints) -> Ints:
+        """Return the rows of ``dropped`` of vertices of jobs; -1: none."""
+        return _last_of(self.dropped, vertex, job)
 
-    def cause(self, key: tuple[int, int], begin: int, end: int) -> int:
-        """Return why the execution of a vertex and job never ran; it did not wait at the end."""
-        reason = self.why_dropped(key)
-        if reason is not None:
-            return _DROPS.get(reason, WAITED)
-        if key in self.unpublished:
-            return NOT_PUBLISHED
-        times = self.dropped_at.get(key[0], ())
-        first, last = np.searchsorted(times, (begin, end))
-        return DROPPED if last > first else LOST
+    def starts_of(self, vertex: Ints, job: Ints) -> Ints:
+        """Return the rows of ``started`` of vertices of jobs; -1: none."""
+        return _last_of(self.started, vertex, job)
+
+    def causes(self, miss: Ints, vertex: Ints, job: Ints, begin: Ints, end: Ints) -> Ints:
+        """Return why vertices of jobs of misses never ran, which did not wait at the end."""
+        lost = np.full(len(miss), LOST)
+        for each, times in self.dropped_at.items():
+            mine = np.flatnonzero(vertex == each)
+            first, last = (np.searchsorted(times, time[mine]) for time in (begin, end))
+            lost[mine[last > first]] = DROPPED
+        drop = self.drops_of(vertex, job)
+        return np.where(drop >= 0, np.append(self.dropped['cause'], UNKNOWN)[drop], np.where(
+            self.unpublished[miss], NOT_PUBLISHED, lost))
 
     def waiting(self, vertices: Ints, times: Ints) -> Ints:
         """Return by vertex the job whose execution waited at the given time, or -1."""
@@ -259,6 +259,22 @@ class Never(NamedTuple):
             last = np.maximum.accumulate(np.where(start == latest, np.arange(len(start)), 0))
             jobs[asked[waits]] = job[last[before[waits]]]
         return jobs
+
+    def got(self, vertex: int, leg: int, jobs: Ints) -> Mask:
+        """Return which jobs have started a vertex with the message of a leg."""
+        started = self.started
+        mine = (started['vertex'] == vertex) & (started['leg'] == leg)
+        return np.isin(jobs, started['job'][mine])
+
+
+def _last_of(table: Table, vertex: Ints, job: Ints) -> Ints:
+    """Return the last rows of a table that have a vertex and job; -1: none."""
+    wanted = np.isin(table['vertex'], distinct(vertex))
+    backwards = np.append(np.flatnonzero(wanted)[::-1], -1)
+    at, _ = equal_pairs(
+        (table['vertex'][backwards[:-1]], table['job'][backwards[:-1]]), (vertex, job))
+    found: Ints = backwards[at]
+    return found
 
 
 class Found(NamedTuple):
@@ -444,36 +460,37 @@ def _pending(
     rows: Table, spans: Table, times: Ints, left: Ints, never: Never, pool: Pool, is_source: Any
 ) -> None:
     """
-    Find what callbacks that never ran were pending for: they waited, or ``Never.cause``.
+    Find what callbacks that never ran were pending for: they waited, or ``Never.causes``.
 
     A timer's skipped release waited if all workers were busy for most of the time; otherwise an
     execution before it waited, or it was noticed late.  The part of a dropped execution ends with
     the drop.
     """
-    pending = np.flatnonzero(spans['kind'] == _PENDING)
-    started = never.started
-    started = started[np.isin(started['vertex'], spans['vertex'][pending]) & np.isin(
-        started['job'], rows['job'][spans['miss'][pending]])]
-    waiting = {(vertex, job): (ready, start, group) for vertex, job, ready, start, group in zip(
-        *(started[name].tolist() for name in ('vertex', 'job', 'ready', 'start', 'group')))}
-    before = never.waiting(spans['vertex'][pending], spans['end'][pending])
-    for i, waiting_job, miss, vertex, begin, end in zip(pending.tolist(), before.tolist(), *(
-            spans[name][pending].tolist() for name in ('miss', 'vertex', 'begin', 'end'))):
-        key = vertex, int(rows['job'][miss])
-        ready, start, group = waiting.get(key, (end, end, 0))
-        waits = ready < end <= start or never.why_dropped(key) == 'aborted'
-        if not waits and key not in never.dropped and (
-                rows['kind'][miss] != SINK_EXPIRED or is_source[vertex]):
-            full, = pool.within('full', spans[i:i + 1])
-            waits = pool.knows_workers and 2 * int(full) >= end - begin
-        if waits:
-            spans['kind'][i], spans['more'][i] = _WAIT, min(group, end - begin)
-        elif is_source[vertex] and key not in never.dropped:
-            times[i, SKIPPED if waiting_job >= 0 else RELEASED_LATE] = left[i]
-        else:
-            times[i, never.cause(key, begin, end)] = left[i]
-            if key in never.dropped:
-                spans['end'][i] = min(end, max(begin, never.dropped[key][1]))
+    which = np.flatnonzero(spans['kind'] == _PENDING)
+    miss, vertex, begin, end = (
+        spans[name][which] for name in ('miss', 'vertex', 'begin', 'end'))
+    job, source = rows['job'][miss], is_source[vertex]
+    start, drop = never.starts_of(vertex, job), never.drops_of(vertex, job)
+    began, dropped = np.append(never.started['start'], 0)[start], drop >= 0
+    waits = np.append(never.dropped['aborted'], False)[drop] | (start >= 0) & (
+        np.append(never.started['ready'], 0)[start] < end) & (end <= began)
+    if pool.knows_workers:
+        may_wait = np.flatnonzero(~waits & ~dropped & (
+            (rows['kind'][miss] != SINK_EXPIRED) | source))
+        full = pool.within('full', spans[which[may_wait]])
+        waits[may_wait] = 2 * full >= (end - begin)[may_wait]
+    spans['kind'][which[waits]] = _WAIT
+    spans['more'][which[waits]] = np.minimum(
+        np.append(never.started['group'], 0)[start], end - begin)[waits]
+    part = np.where(
+        source & ~dropped,
+        np.where(never.waiting(vertex, end) >= 0, SKIPPED, RELEASED_LATE),
+        never.causes(miss, vertex, job, begin, end))
+    other = which[~waits]
+    times[other, part[~waits]] = left[other]
+    ended = ~waits & dropped
+    spans['end'][which[ended]] = np.minimum(end[ended], np.maximum(
+        begin[ended], never.dropped['time'][drop[ended]]))
 
 
 def delayed_by(rows: Table, stall: tuple[int, int]) -> Any:
@@ -527,60 +544,17 @@ def _given_up(
     found = causes[which]
     kind, job, at, release, until = (
         rows[name][which] for name in ('kind', 'job', 'at', 'release', 'until'))
-    dropped = np.array(
-        [key in never.dropped for key in zip(at.tolist(), job.tolist())], dtype=np.bool_)
+    dropped = never.drops_of(at, job) >= 0
     skips = is_source[at] & ~dropped
-    for i in np.flatnonzero(~skips & (dropped | (kind == SINK_EXPIRED))).tolist():
-        found[i] = never.cause((int(at[i]), int(job[i])), int(release[i]), int(until[i]))
+    lost = ~skips & (dropped | (kind == SINK_EXPIRED))
+    found[lost] = never.causes(which, at, job, release, until)[lost]
     found[skips] = skipped[which[skips]]
     before = never.waiting(at, until)
     waits = skips & (before >= 0) & (found != MACHINE)
     raised = rows['kind'] == SINK_FAILED     # a failure does not say why an execution waited
-    of = dict(zip(
-        zip(rows['sink'][~raised].tolist(), rows['job'][~raised].tolist()),
-        causes[~raised].tolist()))
-    found[waits] = [of.get((sink, job), cause) for sink, job, cause in zip(
-        rows['sink'][which[waits]].tolist(), before[waits].tolist(),
-        instead[which[waits]].tolist())]
+    same, _ = equal_pairs(
+        (rows['sink'][~raised], rows['job'][~raised]),
+        (rows['sink'][which[waits]], before[waits]))
+    found[waits] = np.where(
+        same >= 0, np.append(causes[~raised], UNKNOWN)[same], instead[which[waits]])
     return found
-
-
-def behind(
-    found: Found, runs: dict[tuple[int, int], Spans], on_workers: dict[tuple[int, int], Spans],
-    group_of: Members, program_of: Members,
-) -> dict[int, list[tuple[int, int]]]:
-    """
-    Return by part the callbacks that ran while it waited, and how long, longest first.
-
-    :param runs: by callback and place (see ``Pool``) when it ran; ``on_workers``: when its
-        executions occupied a worker.  Only those at the place of the part count.
-    :param group_of: the callback groups, ``program_of``: the programs that run one at a time.
-    """
-    every, rows = found.parts, found.misses
-    share = 10 * every['ns'] >= (rows['until'] - rows['release'])[every['miss']]
-    # a skipped release waited for what the execution before it waited for
-    kinds = np.where(every['cause'] == SKIPPED, found.causes[every['miss']], every['cause'])
-    chosen = np.flatnonzero(np.isin(kinds, _WAITS) & share)
-    waits: dict[int, list[tuple[int, int]]] = {}
-    for place in distinct(every['place'][chosen]).tolist():
-        keys = [key for key in runs if key[1] == place]
-        callbacks = [callback for callback, _ in keys]
-        mine = chosen[every['place'][chosen] == place]
-        if not keys:
-            continue
-        parts = every[mine]
-        begins, ends = parts['begin'], parts['end']
-        times = np.array([runs[key].within(begins, ends) for key in keys])
-        waited = np.isin(kinds[mine], _ON_WORKERS)
-        times[:, waited] = [
-            on_workers[key].within(begins[waited], ends[waited]) for key in keys]
-        for members, causes in ((group_of, (GROUP, NEVER_ENDED)), (program_of, (PROGRAM,))):
-            among = np.isin(kinds[mine], causes)
-            for vertex in distinct(parts['vertex'][among]).tolist():
-                others = [i for i, callback in enumerate(callbacks)
-                          if not members.share(vertex, callback)]
-                times[np.ix_(others, np.flatnonzero(among & (parts['vertex'] == vertex)))] = 0
-        for part, column in zip(mine.tolist(), times.T):
-            order = np.argsort(-column, kind='stable')[:_MOST_BEHIND].tolist()
-            waits[part] = [(callbacks[i], int(column[i])) for i in order if column[i] > 0]
-    return waits

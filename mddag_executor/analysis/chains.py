@@ -11,8 +11,9 @@ first link is the source.  The response time (completion minus release) is the s
 
 * release lag: from the release until the source was ready (timer latency or, with `release_from:
   header_stamp`, the transport of the sensor's message);
-* waiting: from ready to the start of the execution, for a worker or for the callback group (while
-  another callback of the group ran);
+* waiting: from ready to the start of the execution, for a worker, for the callback group (while
+  another callback of the group ran), or for the program (while another callback of a program ran
+  that runs its callbacks one at a time);
 * executing: from the start until the next vertex was ready or the execution ended, whichever was
   first;
 * suspended: the gaps within an execution in which a coroutine waited;
@@ -37,6 +38,7 @@ from functools import cached_property
 from typing import Any, cast, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.analysis.deadlines import Judged
+from mddag_executor.analysis.usage import OtherWaits
 from mddag_executor.core import legs_of, NEVER
 from mddag_executor.core.state import SINK_COMPLETED, SINK_LATE
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
@@ -51,18 +53,19 @@ if TYPE_CHECKING:
 
 LINKS = np.dtype([
     ('of', 'i8'), ('vertex', 'i8'), ('leg', 'i8'), ('ready', 'i8'), ('start', 'i8'),
-    ('end', 'i8'), ('busy', 'i8'), ('group', 'i8'), ('cpu', 'i8'), ('row', 'i8')])
+    ('end', 'i8'), ('busy', 'i8'), ('group', 'i8'), ('program', 'i8'), ('cpu', 'i8'),
+    ('row', 'i8')])
 """
 Columns of a link of a chain.
 
 ``of`` is the number of the chain; ``leg`` is the leg that completed the vertex (-1: it never
 completed). Times of the execution: ready, first start, last end, total time of its pieces, waiting
-for the callback group, CPU time (-1: unknown), ns; ``row`` of the execution.
+for the callback group and for the program, CPU time (-1: unknown), ns; ``row`` of the execution.
 """
 
 PARTS = ('release_lag', 'waiting', 'executing', 'suspended', 'transport', 'unknown',
-         'waiting_group')
-"""The parts of a response time; the last one is a part of ``waiting``."""
+         'waiting_group', 'waiting_program')
+"""The parts of a response time; the last two are parts of ``waiting``."""
 RESPONSE_PARTS = np.dtype([
     ('dag', 'i2'), ('sink', 'i4'), ('job', 'i8'), ('release', 'i8'), ('completed', 'i8'),
     *((name, 'i8') for name in PARTS)])
@@ -78,7 +81,8 @@ class _Chain(NamedTuple):
 
     :ivar known: whether there is an execution; its ``start``, ``end`` and ``pause`` (all gaps).
     :ivar first: when the first link was ready; ``is_whole``: whether it is the source.
-    :ivar sums: waiting, executing, suspended, waiting for groups, up to the start.
+    :ivar sums: waiting, executing, suspended, waiting for groups and for programs, up to the
+        start.
     """
 
     known: Mask
@@ -111,12 +115,13 @@ class Chains:
     """
     The chains of a judged recording.
 
-    :ivar waited: by execution how long its first piece waited for its callback group, ns.
+    :ivar waited: for what the executions waited.
     """
 
-    def __init__(self, judged: Judged, executions: Table, waited: Ints) -> None:
+    def __init__(self, judged: Judged, executions: Table, waited: OtherWaits) -> None:
         if not len(executions):     # row -1 must exist
-            executions, waited = rows(EXECUTIONS, 1, vertex=-1), np.zeros(1, dtype=np.int64)
+            executions = rows(EXECUTIONS, 1, vertex=-1)
+            waited = OtherWaits(*np.zeros((2, 1), dtype=np.int64))
         self._judged, self._executions, self.waited = judged, executions, waited
         self._first = judged.tables.first_vertex
         #: By DAG, vertex and leg the vertex that publishes its message.
@@ -168,7 +173,8 @@ class Chains:
         known = (table['leg'] >= 0) & (table['leg'] < n_legs)   # otherwise the last one
         found = rows(
             LINKS, len(row), vertex=vertex + self._first[dag], ready=table['ready'],
-            start=table['began'], group=self.waited[row], row=row,
+            start=table['began'], group=self.waited.group[row], program=self.waited.program[row],
+            row=row,
             leg=np.where(running, -1, np.where(known, table['leg'], n_legs - 1)),
             cpu=np.where(running, -1, table['cpu']))
         for name in ('end', 'busy'):
@@ -196,13 +202,14 @@ class Chains:
             zero = np.zeros_like(ready)
             chain = _Chain(
                 row[v] >= 0, start, end, pause, ready, np.ones_like(ready, np.bool_),
-                np.array([start - ready, zero, zero, links['group']]))
+                np.array([start - ready, zero, zero, links['group'], links['program']]))
             if legs:
                 leg, published = _published([chains[each] for each in legs], leg, ready)
                 if self._is_driven[dag][v]:
                     ready = np.where(published.known, _answers_from(
                         ready, start, published.end), ready)
                     chain.sums[0] = start - ready
+                    np.minimum(chain.sums[3:], start - ready, out=chain.sums[3:])
                 good, chain = chain.after(published, ready)
                 before[v] = np.where(good, np.array(legs)[leg], -1)
             if v in task.sinks:
@@ -220,6 +227,9 @@ class Chains:
             ended = self._executions['end'][row[vertex, job]]
             links['ready'] = np.where(driven & (vertex >= 0), _answers_from(
                 links['ready'], links['start'], ended), links['ready'])
+            for name in ('group', 'program'):
+                links[name] = np.where(driven, np.minimum(
+                    links[name], links['start'] - links['ready']), links[name])
             yield links
             more = vertex >= 0
             which, vertex, job = which[more], vertex[more], job[more]
@@ -335,7 +345,8 @@ def _parts(done: Table, chain: _Chain) -> tuple[Mask, Table]:
     """
     columns: Any = [each[..., done['row']] for each in chain]
     chain, completed, release = _Chain(*columns), done['completed'], done['release']
-    waiting, executing, suspended, group = np.where(chain.known, chain.until(completed), 0)
+    waiting, executing, suspended, group, program = np.where(
+        chain.known, chain.until(completed), 0)
     first = np.where(chain.known, chain.first, completed)
     lag = np.where(chain.known & chain.is_whole, first - release, 0)
     return chain.known, Table({
@@ -343,7 +354,7 @@ def _parts(done: Table, chain: _Chain) -> tuple[Mask, Table]:
         'completed': completed, 'release_lag': lag, 'waiting': waiting, 'executing': executing,
         'suspended': suspended,
         'transport': completed - first - waiting - executing - suspended,
-        'unknown': first - release - lag, 'waiting_group': group})
+        'unknown': first - release - lag, 'waiting_group': group, 'waiting_program': program})
 
 
 def _published(several: Sequence[_Chain], leg: Ints, ready: Ints) -> tuple[Ints, _Chain]:
@@ -378,4 +389,5 @@ def _step_result(task_set: TaskSet, link: Any) -> ChainLink:
         'vertex': task_set.vertices[int(link['vertex'])].name, 'ready_ns': int(link['ready']),
         'start_ns': int(link['start']), 'end_ns': int(link['end']) if known else None,
         'busy_ns': int(link['busy']) if known else None,
-        'waiting_group_ns': int(link['group']) if known else None}
+        'waiting_group_ns': int(link['group']) if known else None,
+        'waiting_program_ns': int(link['program']) if known else None}

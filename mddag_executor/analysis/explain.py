@@ -13,20 +13,20 @@ last event before it.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.analysis.behind import behind, Members, ran_at
 from mddag_executor.analysis.causes import (
-    behind,
     Busy,
     CAUSES,
     delayed_by,
+    DROPPED_RUNS,
+    DROPS,
     find,
     HANGS_NS,
+    INTERPRETER,
     MACHINE,
-    Members,
     MISSED,
     Never,
     NO_MESSAGE,
@@ -37,6 +37,7 @@ from mddag_executor.analysis.causes import (
     SKIPPED,
     STARTED,
     Usual,
+    WAITED,
 )
 from mddag_executor.analysis.chains import Chains, LINKS
 from mddag_executor.analysis.deadlines import Judged
@@ -48,7 +49,7 @@ from mddag_executor.core.state import SINK_LATE
 from mddag_executor.core.stops import LEAST_NS
 from mddag_executor.core.tally import VERDICTS
 from mddag_executor.recording.columns import concatenate, in_parts, Ints, Mask, rows, Table
-from mddag_executor.recording.joins import different, distinct, rows_by, sort_by
+from mddag_executor.recording.joins import different, distinct, equal_pairs, groups, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
 from msg_graph.model import topological_order
@@ -56,11 +57,13 @@ import numpy as np
 
 if TYPE_CHECKING:
     from mddag_executor.results.replays import (
+        Behind,
         ExplainResult,
         ExplainResultRare,
         LatePath,
         MissedJob,
         Misses,
+        MissesRare,
         MissPart,
     )
 
@@ -89,12 +92,11 @@ class Explanation:
             np.int64)
         #: Begin and end of each stop of the machine.
         self.stops = self._stops()
-        self._to_sinks: dict[int, dict[int, int]] = {}
         missed, links = self._missed(judged, chains)
         pool, usual = self._pool(missed), self._usual()
         missed['outranked'] = self._outranked(missed, links, usual)
         self._never = Never(
-            *self._dropped(), self._started(chains.waited), self._unpublished(missed))
+            *self._dropped(), self._started(chains.waited.group), self._unpublished(missed))
         self.found = find(
             missed, links, pool, usual, self._never,
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
@@ -117,10 +119,10 @@ class Explanation:
         verdicts = judged.missed
         missed = rows(MISSED, len(verdicts), **{
             name: verdicts[name] for name in ('kind', 'sink', 'job', 'release', 'until')})
-        demoted = {(vertex, job): time for vertex, job, time in zip(*(
-            self._recording.demotions[name].tolist() for name in ('vertex', 'job', 'time')))}
-        missed['demoted'] = [demoted.get(key, _NO_END) for key in zip(
-            missed['sink'].tolist(), missed['job'].tolist())]
+        demotions = self._recording.demotions
+        demotion, _ = equal_pairs(
+            (demotions['vertex'], demotions['job']), (missed['sink'], missed['job']))
+        missed['demoted'] = np.append(demotions['time'], _NO_END)[demotion]
         links: list[Table] = []
         for dag in distinct(verdicts['dag']).tolist():
             mine = np.flatnonzero(verdicts['dag'] == dag)
@@ -166,8 +168,9 @@ class Explanation:
             return found, {}
         mine = np.flatnonzero(np.isin(table['start'], unfinished['start']) & (
             table['end'] - table['start'] >= HANGS_NS))
-        known = set(unfinished[['callback', 'start']].tolist())
-        mine = mine[[key in known for key in table[['callback', 'start']][mine].tolist()]]
+        known, _ = equal_pairs(*(
+            (each['callback'], each['start']) for each in (unfinished, table[mine])))
+        mine = mine[known >= 0]
         found[mine] = True
         group = np.array([self._who.groups.get(each, -1)
                           for each in table['callback'][mine].tolist()], dtype=np.int64)
@@ -188,26 +191,34 @@ class Explanation:
         table = self._executions
         on_workers = rows[table['worker'][rows] >= 0]
         start, end = table['start'][on_workers], table['end'][on_workers]
-        # callbacks that ran undeclared may also have held it: a trace does not say
-        holding = rows[(table['holds_gil'][rows] & (table['completes'][rows] > 0))
-                       | (table['vertex'][rows] < 0)
-                       | (hangs & (table['worker'] >= 0))[rows]
-                       ] if self._recording.run.declared else rows
+        holding = rows[self._may_hold(rows, hangs)]
         since, until = table['began'][holding], table['end'][holding]
         return Busy(
             Spans(*crowded(start, end, max(1, self._workers))),
             Spans(*(crowded(since, until, 1) if len(holding) else crowded(start, end, 1))),
             Spans(*crowded(since, until, 2)))
 
+    def _may_hold(self, rows: Ints, hangs: Mask) -> Mask:
+        """Return which executions held the GIL, or may have held it because it is not recorded."""
+        table = self._executions
+        holds, known = table['holds_gil'][rows], table['cpu'][rows] >= 0
+        if not self._recording.run.declared:
+            return holds | ~known
+        return np.where(
+            table['vertex'][rows] < 0, holds | ~known, holds & (table['completes'][rows] > 0)) | (
+            hangs & (table['worker'] >= 0))[rows]
+
     def _answers(self) -> Mask:
         """Return which executions of driven syncs messages of other topics started."""
         driven = {v: each.callback.driven_by for v, each in enumerate(self._task_set.vertices)
                   if each.callback.driven_by is not None}
         found = np.zeros(len(self._executions), dtype=np.bool_)
-        mine = np.flatnonzero(np.isin(self._executions['vertex'], [*driven]))
-        topic = self._recording.names.topic
-        found[mine] = [topic(callback) not in ('', driven[vertex]) for vertex, callback in zip(
-            *(self._executions[name][mine].tolist() for name in ('vertex', 'callback')))]
+        if driven:
+            numbers, which = self._recording.callbacks()
+            topics = [self._recording.names.topic(number) for number in numbers.tolist()]
+        for vertex, topic in driven.items():
+            mine = np.flatnonzero(self._executions['vertex'] == vertex)
+            found[mine] = np.array([each not in ('', topic) for each in topics])[which[mine]]
         return found
 
     def _usual(self) -> Usual:
@@ -248,65 +259,72 @@ class Explanation:
                       & (waits['start'] >= missed['demoted'][waits['of']])]
         at = missed['at'].copy()
         at[waits['of']] = waits['vertex']
-        for miss in np.flatnonzero(found).tolist():
-            sink, release, demoted = (
-                int(missed[name][miss]) for name in ('sink', 'release', 'demoted'))
-            left = release + self._tables.sink_deadline[sink] - demoted
-            needed = self._longest(usual.runs, sink).get(int(at[miss]), 0)
-            found[miss] = left > needed + max(_ROUGHLY_NS, needed // 4)
+        for sink in distinct(missed['sink'][found]).tolist():
+            mine = np.flatnonzero(found & (missed['sink'] == sink))
+            left = missed['release'][mine] + self._tables.sink_deadline[sink] - missed[
+                'demoted'][mine]
+            needed = self._longest(usual.runs, sink)[at[mine]]
+            found[mine] = left > needed + np.maximum(_ROUGHLY_NS, needed // 4)
         return found
 
-    def _longest(self, runs: Ints, sink: int) -> dict[int, int]:
+    def _longest(self, runs: Ints, sink: int) -> Ints:
         """Return by vertex that leads to a sink the usual time until the sink is completed."""
-        if sink not in self._to_sinks:
-            dag = self._task_set.dags[self._tables.dag_of[sink]]
-            first, found = self._tables.first_vertex[dag.index], dict[int, int]()
-            for v in reversed(topological_order(dag)):
-                after = [found[first + each] for each in dag.vertices[v].successors
-                         if first + each in found]
-                if first + v == sink or after:
-                    found[first + v] = int(runs[first + v]) + max(after, default=0)
-            self._to_sinks[sink] = found
-        return self._to_sinks[sink]
+        dag = self._task_set.dags[self._tables.dag_of[sink]]
+        first, found = self._tables.first_vertex[dag.index], dict[int, int]()
+        for v in reversed(topological_order(dag)):
+            after = [found[first + each] for each in dag.vertices[v].successors
+                     if first + each in found]
+            if first + v == sink or after:
+                found[first + v] = int(runs[first + v]) + max(after, default=0)
+        return np.array([found.get(v, 0) for v in range(len(runs))])
 
-    def _dropped(self) -> tuple[dict[tuple[int, int], tuple[str, int]], dict[int, Ints]]:
-        """Return why and when executions were dropped, by vertex and job; and without a job."""
+    def _dropped(self) -> tuple[Table, dict[int, Ints]]:
+        """Return the dropped executions; and by vertex when some without a job were dropped."""
         drops, reasons = self._recording.drops, self._recording.names.drop_reasons
         place = np.array([*self._task_set.places_of_vertices(), -1])
         without = drops[(drops['job'] < 0) & (drops['vertex'] >= 0)]
         of = place[without['vertex']]
-        return {(vertex, job): (reasons[reason], time) for vertex, job, reason, time in zip(
-            *(drops[name].tolist() for name in ('vertex', 'job', 'reason', 'time')))}, {
+        causes, aborted = (np.array(each or [0])[drops['reason']] for each in (
+            [DROPS.get(reason, WAITED) for reason in reasons],
+            [reason == 'aborted' for reason in reasons]))
+        return rows(DROPPED_RUNS, len(drops), cause=causes, aborted=aborted, **{
+            name: drops[name] for name in ('vertex', 'job', 'time')}), {
             vertex: np.sort(without['time'][of == place[vertex]])
             for vertex in np.flatnonzero(np.isin(place[:-1], of)).tolist()}
 
-    def _unpublished(self, missed: Table) -> set[tuple[int, int]]:
+    def _unpublished(self, missed: Table) -> Mask:
         """
-        Return by vertex and job the callbacks that lack a message which was not published.
+        Return which misses lack a message that was not published at the vertex that they reached.
 
         The callback before completed in this job and did not publish the topic.
         """
         recording, table = self._recording, self._executions
+        found = np.zeros(len(missed), dtype=np.bool_)
         if not recording.names.publishers:
-            return set()    # a simulated run: its callbacks always publish
-        wanted = {(vertex, job) for vertex, job in zip(
-            missed['at'].tolist(), missed['job'].tolist())}
-        legs = {vertex: self._topics(vertex) for vertex, _ in wanted}
-        before = {publisher for each in legs.values() for publisher, _ in each}
-        of = np.flatnonzero(np.isin(table['vertex'], list(before)))
-        completed = set(zip(*(table[name][of[table['completes'][of] == VERTEX]].tolist()
-                              for name in ('vertex', 'job'))))
-        sent = recording.publications
-        sent = sent[np.isin(sent['execution'], of)]
-        published: defaultdict[tuple[int, int], set[str]] = defaultdict(set)
-        for vertex, job, number in zip(*(
-                table[name][sent['execution']].tolist() for name in ('vertex', 'job')),
-                sent['publisher'].tolist()):
-            publisher = recording.names.publishers.get(number)
-            published[vertex, job].add('' if publisher is None else publisher.topic)
-        return {(vertex, job) for vertex, job in wanted for publisher, topic in legs[vertex]
-                if (publisher, job) in completed and topic not in published[publisher, job]
-                and '' not in published[publisher, job]}
+            return found    # a simulated run: its callbacks always publish
+        job = recording.jobs.places_of(
+            np.array([*self._tables.dag_of, -1])[missed['at']], missed['job'])
+        topic_of = {number: each.topic for number, each in recording.names.publishers.items()}
+        for vertex in distinct(missed['at']).tolist():
+            mine = np.flatnonzero(missed['at'] == vertex)
+            for publisher, topic in self._topics(vertex):
+                ran = np.flatnonzero(table['vertex'] == publisher)
+                completed = self._jobs_of(ran[table['completes'][ran] == VERTEX])
+                sent = recording.publications
+                sent = sent[np.isin(sent['execution'], ran)]
+                numbers, which = different(sent['publisher'])
+                published = self._jobs_of(sent['execution'][np.array([
+                    topic_of.get(each, '') in ('', topic) for each in numbers.tolist()],
+                    dtype=np.bool_)[which]])
+                found[mine] |= completed[job[mine]] & ~published[job[mine]]
+        return found
+
+    def _jobs_of(self, executions: Ints) -> Mask:
+        """Return by place of a job (see ``Jobs``) whether any of some executions is of it."""
+        found = np.zeros(len(self._recording.jobs) + 1, dtype=np.bool_)
+        found[self._recording.job_places[executions]] = True
+        found[-1] = False   # no job
+        return found
 
     def _topics(self, vertex: int) -> list[tuple[int, str]]:
         """Return the vertices that publish for a vertex, and the topic of each."""
@@ -321,19 +339,23 @@ class Explanation:
         which = np.flatnonzero((table['vertex'] >= 0) & (table['start'] >= 0))
         started = rows(STARTED, len(which), group=in_group[which], **{
             name: table[name][which] for name in ('vertex', 'leg', 'job', 'ready', 'start')})
-        dropped = {
-            (self._tables.dag_of[vertex], job): (vertex, time)
-            for _, vertex, job, time, reason in recording.drops.tolist()
-            if recording.names.drop_reasons[reason] in ('aborted', 'newer')
-            and not self._task_set.vertices[vertex].predecessors}
-        if not dropped:
+        drops, reasons = recording.drops, recording.names.drop_reasons
+        is_source = np.array([*(not v.predecessors for v in self._task_set.vertices), False])
+        drops = drops[is_source[drops['vertex']] & np.array([
+            reason in ('aborted', 'newer') for reason in reasons] or [False])[drops['reason']]]
+        # by place of a job its drop; the last one is written last
+        drop = np.full(len(recording.jobs) + 1, -1)
+        drop[recording.jobs.places_of(
+            np.array([*self._tables.dag_of, -1])[drops['vertex']], drops['job'])] = np.arange(
+            len(drops))
+        mine = np.flatnonzero(drop[:-1] >= 0)
+        if not len(mine):
             return started
         # a release that was skipped at the time of the abort was skipped before it
-        waited = [(vertex, job, noticed, time + 1) for dag, job, noticed in zip(*(
-            recording.releases[name].tolist() for name in ('dag', 'job', 'noticed')))
-            if (dag, job) in dropped for vertex, time in [dropped[dag, job]]]
-        sources = rows(STARTED, len(waited), **dict(zip(
-            ('vertex', 'job', 'ready', 'start'), zip(*waited))))
+        dropped = drops[drop[mine]]
+        sources = rows(
+            STARTED, len(mine), vertex=dropped['vertex'], job=dropped['job'],
+            ready=recording.jobs.noticed[mine], start=dropped['time'] + 1)
         sources['group'] = self._in_groups(sources)
         return concatenate([started, sources])
 
@@ -367,20 +389,11 @@ class Explanation:
         return sorted(found)
 
     @cached_property
-    def _waited(self) -> dict[int, list[tuple[int, int]]]:
-        """Return by part of a miss the callbacks that it waited for, and how long."""
-        table, rows = self._executions, self._rows
-        callbacks, which = different(table['callback'][rows])
-        runs, on_workers = {}, {}
-        for callback, at in zip(callbacks.tolist(), rows_by(which, len(callbacks))):
-            places = self._place[rows[at]]
-            for place in distinct(places).tolist():
-                mine = rows[at[places == place]]
-                runs[callback, place], on_workers[callback, place] = (
-                    Spans(table['start'][each], table['end'][each])
-                    for each in (mine, mine[table['worker'][mine] >= 0]))
-        return behind(self.found, runs, on_workers, *(Members(self._by_vertex(of), of) for of in (
-            self._who.groups, self._who.programs)))
+    def behind(self) -> Table:
+        """Return the callbacks that ran longest while parts of misses waited: ``BEHIND``."""
+        return behind(
+            self.found, ran_at(self._executions, self._rows, self._place),
+            *(Members(self._by_vertex(of), of) for of in (self._who.groups, self._who.programs)))
 
     @cached_property
     def _vertices(self) -> dict[int, int]:
@@ -399,27 +412,45 @@ class Explanation:
         """Return by vertex what is known of its callback, or -1."""
         return {vertex: of.get(callback, -1) for callback, vertex in self._vertices.items()}
 
-    @cached_property
-    def _names(self) -> dict[int, str]:
-        """Return the names of the callbacks that others waited for."""
+    def names_of(self, callbacks: Ints) -> list[str]:
+        """Return the names of callbacks that ran, given by their numbers."""
+        numbers, which = different(callbacks)
         vertices, ran_as = self._task_set.vertices, self._vertices
-        callbacks = {callback for each in self._waited.values() for callback, _ in each}
-        return {
-            callback: vertices[ran_as[callback]].callback.key if callback in ran_as
-            else self._who.name(callback) for callback in callbacks}
+        names = [vertices[ran_as[number]].callback.key if number in ran_as
+                 else self._who.name(number) for number in numbers.tolist()]
+        return [names[each] for each in which.tolist()]
 
     # --- results ---------------------------------------------------------------------------------
 
     def summary(self) -> Misses:
         """Return the number of misses by cause, in total and by sink, and the stops."""
         names = [v.name for v in self._task_set.vertices]
+        more: MissesRare = {}
+        if assumed := self._assumed():
+            more['interpreter_assumed'] = assumed
         return {
             'missed': int(self._counts.sum()),
             'causes': dict(zip(CAUSES, self._counts.sum(axis=0).tolist())),
             'sinks': {names[v]: dict(zip(CAUSES, self._counts[v].tolist()))
                       for v in self._tables.sinks if self._counts[v].any()},
             'stalls': [{'at_ns': begin, 'length_ns': end - begin,
-                        'misses': self._in_stops[begin, end]} for begin, end in self.stops]}
+                        'misses': self._in_stops[begin, end]} for begin, end in self.stops],
+            **more}
+
+    def _assumed(self) -> int:
+        """Return the number of misses by the interpreter, if it is not recorded who held it."""
+        parts, table = self.found.parts, self._executions
+        waits = np.flatnonzero((parts['cause'] == INTERPRETER) & (
+            self.found.causes[parts['miss']] == INTERPRETER))
+        held = self._rows[table['holds_gil'][self._rows] & (table['cpu'][self._rows] >= 0)]
+        known = np.zeros(len(waits), dtype=np.int64)
+        for place in distinct(parts['place'][waits]).tolist():
+            mine, rows = (np.flatnonzero(each == place) for each in (
+                parts['place'][waits], self._place[held]))
+            spans = Spans(*crowded(table['began'][held[rows]], table['end'][held[rows]], 1))
+            known[mine] = spans.within(
+                parts['begin'][waits[mine]], parts['end'][waits[mine]])
+        return len(distinct(parts['miss'][waits[known < parts['ns'][waits]]]))
 
     def result(
         self, sink: int | None = None, job: int | None = None,
@@ -434,74 +465,83 @@ class Explanation:
         more: ExplainResultRare = {}
         if requirements:
             more['requirements'] = requirements
-        return {**self.summary(), 'jobs': list(self._jobs(sink, job)), **more}
-
-    def _jobs(self, sink: int | None, job: int | None) -> Iterator[MissedJob]:
-        missed, parts = self.found.misses, self.found.parts
-        wanted = np.ones(len(missed), dtype=np.bool_)
+        wanted = np.ones(len(self.found.misses), dtype=np.bool_)
         for column, value in (('sink', sink), ('job', job)):
             if value is not None:
-                wanted &= missed[column] == value
-        if not wanted.any():
-            return
-        first = np.searchsorted(parts['miss'], np.arange(len(missed) + 1)).tolist()
-        vertices = self._task_set.vertices
-        for miss in np.flatnonzero(wanted).tolist():
-            kind, vertex, number, release, until, *_ = missed[miss].item()
-            deadline = self._tables.sink_deadline[vertex]
-            yield {
-                'dag': self._task_set.dags[self._tables.dag_of[vertex]].name, 'job': number,
-                'sink': vertices[vertex].name, 'verdict': VERDICTS[kind],
-                'release_ns': release, 'deadline_ns': release + deadline, 'until_ns': until,
-                'late_ns': until - release - deadline if kind == SINK_LATE else None,
-                'cause': CAUSES[self.found.causes[miss]], 'parts': [
-                    self._part(i, number)
-                    for i in range(first[miss], first[miss + 1])]}
+                wanted &= self.found.misses[column] == value
+        return {**self.summary(), 'jobs': self._jobs(np.flatnonzero(wanted)), **more}
 
-    def _part(self, place: int, job: int) -> MissPart:
-        part = self.found.parts[place]
-        found: MissPart = {
-            'vertex': self._task_set.vertices[int(part['vertex'])].name,
-            'cause': PARTS[part['cause']], 'ns': int(part['ns']), 'behind': [
-                {'callback': self._names[callback], 'ns': took}
-                for callback, took in self._waited.get(place, ())]}
-        if part['cause'] == SKIPPED:
-            found['waiting_job'] = int(self._never.waiting(
-                part['vertex'][None], part['end'][None])[0])
-        if part['cause'] in NO_MESSAGE:
-            found['topics'] = self._missing(int(part['vertex']), job)
+    def _jobs(self, which: Ints) -> list[MissedJob]:
+        """Return what is known of some misses."""
+        missed, vertices = self.found.misses[which], self._task_set.vertices
+        of = np.flatnonzero(np.isin(self.found.parts['miss'], which))
+        parts, miss = self._parts(of), self.found.parts['miss'][of]
+        first, until = (np.searchsorted(miss, which, side).tolist() for side in ('left', 'right'))
+        found: list[MissedJob] = []
+        for i, (kind, sink, number, release, until_ns, cause) in enumerate(zip(*(
+                each.tolist() for each in (
+                    *missed.columns('kind', 'sink', 'job', 'release', 'until'),
+                    self.found.causes[which])))):
+            deadline = release + self._tables.sink_deadline[sink]
+            found.append({
+                'dag': self._task_set.dags[self._tables.dag_of[sink]].name, 'job': number,
+                'sink': vertices[sink].name, 'verdict': VERDICTS[kind],
+                'release_ns': release, 'deadline_ns': deadline, 'until_ns': until_ns,
+                'late_ns': until_ns - deadline if kind == SINK_LATE else None,
+                'cause': CAUSES[cause], 'parts': parts[first[i]:until[i]]})
         return found
 
-    def _missing(self, vertex: int, job: int) -> list[str]:
-        """Return the topics whose messages a vertex of a job has not got."""
-        one, started = self._task_set.vertices[vertex], self._never.started
-        got = set(started['leg'][(started['vertex'] == vertex) & (started['job'] == job)].tolist())
-        legs = legs_of(one, self._task_set.dags[one.dag].vertices)
-        return sorted({one.callback.topics[place] for leg, (place, _) in enumerate(legs)
-                       if leg not in got and one.callback.topics})
+    def _parts(self, which: Ints) -> list[MissPart]:
+        """Return what is known of some parts of misses."""
+        parts, names = self.found.parts[which], [v.name for v in self._task_set.vertices]
+        waits = self.behind[np.isin(self.behind['part'], which)]
+        others: list[Behind] = [{'callback': name, 'ns': ns} for name, ns in zip(
+            self.names_of(waits['callback']), waits['ns'].tolist())]
+        first, until = (np.searchsorted(waits['part'], which, side) for side in ('left', 'right'))
+        vertex, cause = parts['vertex'], parts['cause']
+        found: list[MissPart] = [
+            {'vertex': names[v], 'cause': PARTS[c], 'ns': ns, 'behind': others[begin:end]}
+            for v, c, ns, begin, end in zip(*(
+                each.tolist() for each in (vertex, cause, parts['ns'], first, until)))]
+        at = np.flatnonzero(cause == SKIPPED)
+        for i, job in zip(at.tolist(), self._never.waiting(
+                vertex[at], parts['end'][at]).tolist()):
+            found[i]['waiting_job'] = job
+        at = np.flatnonzero(np.isin(cause, NO_MESSAGE))
+        for i, topics in zip(at.tolist(), self._missing(
+                vertex[at], self.found.misses['job'][parts['miss'][at]])):
+            found[i]['topics'] = topics
+        return found
 
-    def behind(self) -> dict[int, list[tuple[str, int]]]:
-        """Return by part of a miss the callbacks that ran while it waited, and how long, ns."""
-        return {part: [(self._names[callback], took) for callback, took in waits]
-                for part, waits in sorted(self._waited.items())}
+    def _missing(self, vertices: Ints, jobs: Ints) -> list[list[str]]:
+        """Return the topics whose messages vertices of jobs have not got."""
+        found: list[list[str]] = [[] for _ in range(len(jobs))]
+        for vertex in distinct(vertices).tolist():
+            one, mine = self._task_set.vertices[vertex], np.flatnonzero(vertices == vertex)
+            legs = [*legs_of(one, self._task_set.dags[one.dag].vertices)]
+            if not one.callback.topics:
+                continue
+            got = [self._never.got(vertex, leg, jobs[mine]).tolist() for leg in range(len(legs))]
+            for i, has in zip(mine.tolist(), zip(*got)):
+                found[i] = sorted({
+                    one.callback.topics[place] for (place, _), has_it in zip(legs, has)
+                    if not has_it})
+        return found
 
-    def causes(self) -> dict[tuple[int, int], str]:
-        """Return the cause of each miss, by global vertex of the sink and job."""
-        missed = self.found.misses
-        return {(sink, job): CAUSES[cause] for sink, job, cause in zip(
-            missed['sink'].tolist(), missed['job'].tolist(), self.found.causes.tolist())}
+    def misses_of(self, verdicts: Table) -> Ints:
+        """Return by verdict its row in ``found.misses``; -1: it is no miss."""
+        row, _ = equal_pairs(*(
+            (each['sink'], each['job']) for each in (self.found.misses, verdicts)))
+        return row
 
-    def longest_behind(self) -> dict[tuple[int, int], str]:
-        """Return by sink and job the callback that the miss waited for longest, if it waited."""
-        waits: defaultdict[int, Counter[int]] = defaultdict(Counter)
-        of = self.found.parts['miss']
-        for part, callbacks in self._waited.items():
-            for callback, took in callbacks:
-                waits[int(of[part])][callback] += took
-        missed = self.found.misses
-        return {(int(missed['sink'][miss]), int(missed['job'][miss])):
-                self._names[max(took, key=lambda callback: (took[callback], -callback))]
-                for miss, took in waits.items()}
+    def longest_behind(self) -> list[str]:
+        """Return by miss the callback that it waited for longest; '' if it did not wait."""
+        waits = self.behind[sort_by(self.behind['callback'])]   # the first of equal ones counts
+        most = most_of(self.found.parts['miss'][waits['part']], waits['callback'], waits['ns'])
+        found = [''] * len(self.found.misses)
+        for miss, name in zip(most['group'].tolist(), self.names_of(most['value'])):
+            found[miss] = name
+        return found
 
     def worst(self) -> MissedJob | None:
         """Return the latest job; if none completed, the first miss."""
@@ -511,8 +551,7 @@ class Explanation:
         deadline = np.array([*self._tables.sink_deadline, 0], dtype=np.int64)
         late = np.where(every['kind'] == SINK_LATE, every['until'] - every['release']
                         - deadline[every['sink']], -1)
-        worst = every[late.argmax()]
-        return next(self._jobs(int(worst['sink']), int(worst['job'])))
+        return self._jobs(late.argmax(keepdims=True))[0]
 
     def mostly(self) -> list[dict[str, Any]]:
         """
@@ -521,31 +560,51 @@ class Explanation:
         ``ns`` is the mean time of the misses with this cause, ``vertex`` where most of it went,
         and ``behind`` the callback that they waited for longest, None if they did not wait.
         """
-        at: defaultdict[tuple[int, int], Counter[int]] = defaultdict(Counter)
-        after: defaultdict[tuple[int, int], Counter[int]] = defaultdict(Counter)
         missed, causes, parts, too_short = self.found
-        sinks, cause_of = missed['sink'].tolist(), causes.tolist()
-        of, kind = parts['miss'], parts['cause']
-        mine = np.flatnonzero((kind == causes[of]) | (kind == SKIPPED) | (
-            (kind == RAN_USUALLY) & (causes[of] == RAN_LONG) & too_short[of]))
-        for i, miss, vertex, ns in zip(mine.tolist(), *(
-                parts[name][mine].tolist() for name in ('miss', 'vertex', 'ns'))):
-            key = sinks[miss], cause_of[miss]
-            at[key][vertex] += ns
-            for callback, took in self._waited.get(i, ()):
-                after[key][callback] += took
+        n_causes = len(CAUSES)
+        key = missed['sink'] * n_causes + causes
+        of, kind, waits = parts['miss'], parts['cause'], self.behind
+        counts = (kind == causes[of]) | (kind == SKIPPED) | (
+            (kind == RAN_USUALLY) & (causes[of] == RAN_LONG) & too_short[of])
+        at = most_of(key[of[counts]], parts['vertex'][counts], parts['ns'][counts])
+        waits = waits[counts[waits['part']]]
+        after = most_of(key[of[waits['part']]], waits['callback'], waits['ns'])
+        where = {group: (value, total) for group, value, total in at.tolist()}
+        behind = dict(zip(after['group'].tolist(), self.names_of(after['value'])))
+        order = sort_by(key)
+        begins, until = groups(key[order])
+        keys, n, first = key[order[begins]], until - begins, order[begins]
         found, vertices = [], self._task_set.vertices
-        for key, n in sorted(Counter(zip(sinks, cause_of)).items(),
-                             key=lambda item: (item[0][0], -item[1])):
-            sink, cause = key
-            where, waited = (each[key].most_common(1) for each in (at, after))
+        in_order = sort_by(keys // n_causes, -n, first)
+        for each, count in zip(keys[in_order].tolist(), n[in_order].tolist()):
+            sink, cause = divmod(each, n_causes)
+            vertex, total = where.get(each, (None, 0))
             found.append({
                 'dag': self._task_set.dags[self._tables.dag_of[sink]].name,
-                'sink': vertices[sink].name, 'cause': CAUSES[cause], 'missed': n,
-                'ns': at[key].total() // n,
-                'vertex': vertices[where[0][0]].name if where else None,
-                'behind': self._names[waited[0][0]] if waited else None})
+                'sink': vertices[sink].name, 'cause': CAUSES[cause], 'missed': count,
+                'ns': total // count,
+                'vertex': None if vertex is None else vertices[vertex].name,
+                'behind': behind.get(each)})
         return found
+
+
+MOST = np.dtype([('group', 'i8'), ('value', 'i8'), ('total', 'i8')])
+"""Columns: a group, the value with the largest sum in it, and the sum of all of its values."""
+
+
+def most_of(group: Ints, value: Ints, amount: Ints) -> Table:
+    """Return by group the value whose amounts have the largest sum; of equal ones the first."""
+    if not len(group):
+        return rows(MOST)
+    order = sort_by(group, value)
+    begins = np.flatnonzero(np.append(True, (np.diff(group[order]) != 0) | (
+        np.diff(value[order]) != 0)))
+    first, sums = order[begins], np.add.reduceat(amount[order], begins)
+    rank = sort_by(group[first], -sums, first)
+    begins, _ = groups(group[first[rank]])
+    most = first[rank[begins]]
+    return rows(MOST, len(most), group=group[most], value=value[most],
+                total=np.add.reduceat(sums[rank], begins))
 
 
 def medians(numbers: Any, times: Ints, count: int) -> Ints:

@@ -17,9 +17,9 @@ Theory of operation
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any, cast, NamedTuple, TYPE_CHECKING
 
-from mddag_executor.analysis.spans import Spans
+from mddag_executor.analysis.spans import crowded, Spans
 from mddag_executor.recording.columns import in_parts, Ints, Table
 from mddag_executor.recording.columns import rows as table_of
 from mddag_executor.recording.joins import different, distinct, later_pieces, rows_by, sort_by
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from mddag_executor.results.replays import CallbackUse, OverTime, WorkerUse
 
 _ALWAYS = ('executions', 'busy_ns', 'longest_ns', 'waiting_ns', 'longest_wait_ns',
-           'waiting_group_ns')
+           'waiting_group_ns', 'waiting_program_ns')
 _MEASURED = 'measured', 'measured_busy_ns', 'cpu_ns', 'held_interpreter'
 USAGE = np.dtype([(name, 'i8') for name in (*_ALWAYS, *_MEASURED)])
 """The columns of a callback; the last four are of executions with known CPU time."""
@@ -95,6 +95,42 @@ def group_waits(recording: Recording) -> Ints:
     later, first = later_pieces(table)
     waited[later] = waited[first]
     return waited
+
+
+def program_waits(recording: Recording, in_group: Ints) -> Ints:
+    """
+    Return by execution how long other callbacks of its program ran while it waited, ns.
+
+    Only callbacks of programs that run their callbacks one at a time wait for them.  Time in which
+    it waited for its callback group (``in_group``) does not count a second time.
+    """
+    table, programs = recording.executions, recording.runs_of_programs()
+    waited = np.broadcast_to(np.int64(0), len(table))   # which takes no memory
+    if not programs:
+        return waited
+    waited = waited.copy()
+    for number, runs in programs.items():
+        rows = np.flatnonzero((recording.programs_of_executions == number) & (
+            table['piece'] == 0) & (table['start'] >= 0))
+        occupied = Spans(*crowded(runs['start'], runs['end'], 1)).within(
+            table['ready'][rows], table['start'][rows])
+        waited[rows] = np.maximum(0, occupied - in_group[rows])
+    later, first = later_pieces(table)
+    waited[later] = waited[first]
+    return waited
+
+
+class OtherWaits(NamedTuple):
+    """By execution how long it waited for its callback ``group``, and for its ``program``, ns."""
+
+    group: Ints
+    program: Ints
+
+    @classmethod
+    def of(cls, recording: Recording) -> OtherWaits:
+        """Return the waits of a recording's executions; all pieces of one have the same."""
+        in_group = group_waits(recording)
+        return cls(in_group, program_waits(recording, in_group))
 
 
 def worker_spans(
@@ -179,11 +215,13 @@ class Usage:
     """
     The time that callbacks and workers used in a recording.
 
-    :param waited: see ``group_waits``.
+    :param waited: what the executions waited for.
     :param begin: the span of the workers' time begins; ``end``: ends.
     """
 
-    def __init__(self, recording: Recording, waited: Ints, begin: int, end: int) -> None:
+    def __init__(
+        self, recording: Recording, waited: OtherWaits, begin: int, end: int
+    ) -> None:
         task_set = recording.task_set
         self._places = task_set.callback_indices()
         # by global vertex the index of its callback; the last entry is for undeclared ones
@@ -192,9 +230,9 @@ class Usage:
         self.table = table_of(USAGE, len(self._places) + 1)
         self._duration = end - begin
         table = recording.executions
-        for part, wait in zip(in_parts(table), in_parts(waited)):
+        for part, *waits in zip(in_parts(table), *map(in_parts, waited)):
             ran = (part['start'] >= 0) & (part['end'] >= 0)
-            self._ran(part[_TIMES][ran], wait[ran])
+            self._ran(part[_TIMES][ran], OtherWaits(*(each[ran] for each in waits)))
             self._completed(part[_TOTALS][ran & (part['completes'] != NOTHING) & (
                 part['vertex'] >= 0)])
         spans = worker_spans(recording, begin, end)
@@ -210,7 +248,7 @@ class Usage:
         self._lent = int(np.maximum(0, np.minimum(table['end'][lent], end) - np.maximum(
             table['start'][lent], begin)).sum())
 
-    def _ran(self, table: Table, waited: Ints) -> None:
+    def _ran(self, table: Table, waited: OtherWaits) -> None:
         vertex, start = table['vertex'], table['start']
         took, place = table['end'] - start, self._place[vertex]
         self._add('busy_ns', place, took)
@@ -220,7 +258,8 @@ class Usage:
         place, wait = place[first], (start - table['ready'])[first]
         self._add('waiting_ns', place, wait)
         self._most('longest_wait_ns', place, wait)
-        self._add('waiting_group_ns', place, waited[first])
+        self._add('waiting_group_ns', place, waited.group[first])
+        self._add('waiting_program_ns', place, waited.program[first])
 
     def _completed(self, table: Table) -> None:
         place, busy = self._place[table['vertex']], table['busy']

@@ -88,6 +88,7 @@ def _check_job(job: int, outcome: Replay, sink: int | None) -> None:
 
 def _lines(outcome: Replay, late_paths: dict[str, dict[str, LatePath]]) -> Iterator[str]:
     from mddag_executor.report.explained import (
+        assumed_line,
         causes_line,
         causes_table,
         job_lines,
@@ -100,6 +101,7 @@ def _lines(outcome: Replay, late_paths: dict[str, dict[str, LatePath]]) -> Itera
     summary = explanation.summary()
     if summary['missed']:
         yield causes_table(summary)
+        yield from assumed_line(summary)
         yield 'Where that time went:'
         yield sinks_table(explanation.mostly())
         if summary['stalls']:

@@ -75,6 +75,8 @@ MAX_ACTIVE_JOBS = 64
 """How many jobs of a DAG may be open at a time."""
 EXPIRE_AFTER_NS = 1_000_000_000
 """An idle job expires this long after its latest deadline, ns."""
+MOST_SKIPPED = 1000
+"""After a long stop (a suspended machine) at most this many releases are judged one by one."""
 
 UNJUDGED_PERIODS = 10
 """A sink without a deadline is ordered as if it had one of this many periods of its DAG, …"""

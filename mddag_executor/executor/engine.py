@@ -54,6 +54,7 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
+from mddag_executor.core.tables import MOST_SKIPPED
 from mddag_executor.executor.answers import Answers, open_release
 from mddag_executor.executor.attribution import (
     Announced,
@@ -80,8 +81,6 @@ if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
 
 KEEP_STEPS = 100
-MOST_MISSED = 1000
-"""After a long stop (a suspended machine) at most this many releases are judged one by one."""
 
 
 class PublisherRecorder(Protocol):
@@ -249,7 +248,7 @@ class Engine:
         due, count = due + early * period, count - early
         entity.skipped += count
         if entity.source >= 0:
-            for i in range(max(1, count - MOST_MISSED + 1), count + 1):
+            for i in range(max(1, count - MOST_SKIPPED + 1), count + 1):
                 self._skip_job(entity, min(due + i * period, now), now)
 
     def arrived(

@@ -91,15 +91,15 @@ class RunRecords:
         slot, dag, job, vertex = work.origin or NO_ORIGIN
         if goes_on and dag < 0:     # only this says which pieces are one execution
             job = GOES_ON
-        index, deadline = -1, 0
-        if dag >= 0:
-            index = self._tables.index_in_dag[vertex]
+        index, deadline, cpu_ns, holds = -1, 0, work.cpu_ns, work.entity.habit.holds
+        if dag >= 0:    # its completion says how long it computed
+            index, cpu_ns, holds = self._tables.index_in_dag[vertex], -1, 0
             deadline = self._state.job_release[slot] + self._tables.rad_offset[vertex]
         elif x >= 0 and self._state.x_like[x] >= 0:     # it inherits
             deadline = self._state.x_key[x][0]
         self._record(
             'dispatch', time, vtid, work.entity.address, dag, index, job, worker, work.ready_ns,
-            deadline, work.due_ns)
+            deadline, work.due_ns, cpu_ns, holds)
 
     def waiting(self, several: Iterable[Work], now: int) -> None:
         """Record what waits at the end as dispatched then: a reader sees that it was not lost."""

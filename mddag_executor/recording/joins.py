@@ -149,7 +149,7 @@ def equal_pairs(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[In
 
 def _pair_keys(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[Ints, Ints]:
     """Return one number for each pair, in the order of the pairs."""
-    first, second = (np.append(*both) for both in zip(known, wanted))
+    first, second = (np.append(*both).astype(np.int64) for both in zip(known, wanted))
     if not len(first):
         return first, first
     least, span = int(second.min()), int(second.max()) - int(second.min()) + 1
@@ -157,7 +157,8 @@ def _pair_keys(known: tuple[Ints, Ints], wanted: tuple[Ints, Ints]) -> tuple[Int
         second -= least
     else:
         values, second = different(second)
-        span = len(values)
+        span, (_, first) = len(values), different(first)
+        first = first.astype(np.int64)
     keys = first * span + second
     return keys[:len(known[0])], keys[len(known[0]):]
 

@@ -181,7 +181,7 @@ class Recording:
         """
         if not self.names.programs:
             return {}
-        table, program = self.executions, self._programs
+        table, program = self.executions, self.programs_of_executions
         rows = np.flatnonzero((program >= 0) & (table['worker'] >= 0))
         found = {}
         for number in np.unique(program[rows]).tolist():
@@ -201,7 +201,7 @@ class Recording:
         groups, programs = self.names.groups, self.names.programs
         if not programs:
             return groups
-        table, program = self.executions, self._programs
+        table, program = self.executions, self.programs_of_executions
         ran = np.bincount(program[(program >= 0) & (table['worker'] >= 0)])
         let_others = {*program[table['piece'] > 0].tolist(), *(
             number for number, runs in self.runs_of_programs().items()
@@ -228,7 +228,7 @@ class Recording:
         return self._keys.get(number) or self.names.name(number)
 
     @cached_property
-    def _programs(self) -> Ints:
+    def programs_of_executions(self) -> Ints:
         """Return by execution its program, if that runs one callback at a time; else -1."""
         numbers, index = self.callbacks()
         of = self.names.programs

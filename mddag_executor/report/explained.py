@@ -37,6 +37,14 @@ def causes_table(misses: Mapping[str, Any]) -> str:
         for cause, n in _most_first(misses)])
 
 
+def assumed_line(misses: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line about the misses of which the cause is assumed, if there are any."""
+    if 'interpreter_assumed' in misses:
+        yield (f'{misses["interpreter_assumed"]} of {misses["causes"]["interpreter"]} misses by '
+               'the interpreter are assumed: this recording does not say whether the callbacks '
+               'that ran meanwhile held it')
+
+
 def sinks_table(mostly: Sequence[Mapping[str, Any]]) -> str:
     """Return a table of the causes of each sink, and where most of that time went."""
     names = short_names({name for each in mostly for name in (

@@ -69,8 +69,7 @@ def of_outcome(
     if isinstance(outcome, Replay):
         return _data(
             'Replay as recorded', [('recording', trace)], result, outcome, outcome.duration_ns,
-        )._replace(causes=outcome.explanation.causes(),
-                   behind=outcome.explanation.longest_behind(),
+        )._replace(explanation=outcome.explanation,
                    worker_names=outcome.recording.names.workers)
     what, title = ('bag', 'Bag') if outcome.recorded is None else ('recording', 'Replay')
     data = _data(f'{title}, rescheduled', [(what, trace)], result,

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import zlib
 
 from mddag_executor.analysis.as_recorded import Replay
+from mddag_executor.analysis.explain import Explanation
 from mddag_executor.analysis.usage import PoolUse
 from mddag_executor.core.state import SINK_IN_TIME
 from mddag_executor.core.tally import counts, SinkTally, VERDICTS
@@ -49,8 +50,7 @@ class ReportData(NamedTuple):
     :ivar result: of the run, as in the result of a replay or simulation.
     :ivar replay: the run as it was recorded or computed.
     :ivar duration_ns: from the first release to the end of the run.
-    :ivar causes: the cause of each miss, by global vertex of the sink and job.
-    :ivar behind: the callback that most delayed it, for misses that waited, by the same keys.
+    :ivar explanation: why deadlines were missed; None: it was not recorded, but computed.
     :ivar worker_names: the names of workers, if they are more than a number.
     """
 
@@ -60,8 +60,7 @@ class ReportData(NamedTuple):
     replay: Replay
     timeline: Timeline
     duration_ns: int
-    causes: Mapping[tuple[int, int], str] = {}
-    behind: Mapping[tuple[int, int], str] = {}
+    explanation: Explanation | None = None
     worker_names: Sequence[str] = ()
 
 

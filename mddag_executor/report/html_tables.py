@@ -8,6 +8,7 @@ from collections.abc import Container, Iterable, Iterator, Sequence
 from html import escape
 from pathlib import Path
 
+from mddag_executor.analysis.causes import CAUSES
 from mddag_executor.core.tally import counts, total, VERDICTS
 from mddag_executor.recording.columns import Table
 from mddag_executor.report.html_data import ReportData, slack_class
@@ -153,31 +154,42 @@ def misses_html(data: ReportData, misses: Table) -> str:
         return ('<p class="note">No deadline was missed.</p>\n' if total(data.result['dags']).due
                 else '<p class="note">No job was due at any sink: nothing is proven.</p>\n')
     task_set, start = data.replay.task_set, data.replay.recording.start or 0
-    short = short_names([*(vertex.name for vertex in task_set.vertices), *data.behind.values()])
-    more = [(title, of) for title, of in (('cause', data.causes), ('mostly behind', data.behind))
-            if of]
-    header = ('DAG', 'sink', 'verdict', *(title for title, _ in more), 'job', 'released at',
-              'response', 'late by')
+    why = _why(data, misses)
+    short = short_names([*(vertex.name for vertex in task_set.vertices), *(
+        name for name in why.get('mostly behind', ()) if name)])
+    header = ('DAG', 'sink', 'verdict', *why, 'job', 'released at', 'response', 'late by')
     rows = []
-    for miss in misses:
+    for miss, *texts in zip(misses, *why.values()):
         sink, job, release, deadline, completed = (int(miss[name]) for name in (
             'sink', 'job', 'release', 'deadline', 'completed'))
-        why = (of.get((sink, job)) for _, of in more)
         rows.append((
             task_set.dags[miss['dag']].name, short[task_set.vertices[sink].name],
-            VERDICTS[miss['kind']], *(text and short.get(text, text) for text in why), job,
+            VERDICTS[miss['kind']], *(short.get(text, text) or None for text in texts), job,
             f'{(release - start) / 1e9:.6f} s',
             *(None if completed < 0 else format_ns(completed - since, 3)
               for since in (release, deadline))))
     what = 'All' if len(rows) == data.timeline.n_missed else (
         f'{len(rows)} of {data.timeline.n_missed} (the worst of each sink come first into this '
         'list)')
-    table = html_table(header, rows, 3 + len(more),
+    table = html_table(header, rows, 3 + len(why),
                        attributes=[f'data-miss="{i}"' for i in range(len(rows))])
     return '<h2>Missed deadlines</h2>\n' + data_table(
         table, 'search misses', 0, 'misses',
         f'{what}, in the order of time. Click on a title to sort, on a miss to see it in the '
         'timeline.')
+
+
+def _why(data: ReportData, misses: Table) -> dict[str, list[str]]:
+    """Return the columns that say why each miss was late, without those that no miss has."""
+    explanation = data.explanation
+    if explanation is None:
+        return {}
+    row = explanation.misses_of(misses).tolist()
+    longest, causes = explanation.longest_behind(), explanation.found.causes.tolist()
+    found = {'cause': [CAUSES[causes[each]] for each in row]}
+    if any(longest):
+        found['mostly behind'] = [longest[each] for each in row]
+    return found
 
 
 def worst_html(data: ReportData) -> str:

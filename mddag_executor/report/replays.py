@@ -25,9 +25,10 @@ from msg_graph.binding import is_background
 
 _PARTS = {
     'release lag': 'release_lag_ns', 'waiting': 'waiting_ns', 'for group': 'waiting_group_ns',
+    'for program': 'waiting_program_ns',
     'executing': 'executing_ns', 'suspended': 'suspended_ns', 'transport': 'transport_ns',
     'unknown': 'unknown_ns'}
-_RARE = 'for group', 'suspended', 'unknown'
+_RARE = 'for group', 'for program', 'suspended', 'unknown'
 _CALLBACKS = (
     'callback', 'executions', 'busy', 'mean', 'longest', 'mean wait', 'longest wait', 'CPU',
     'interpreter')

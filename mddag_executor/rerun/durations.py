@@ -22,33 +22,36 @@ from bisect import bisect_left
 from functools import cache
 
 from mddag_executor.core import NEVER, quantile, Tables
-from mddag_executor.simulate.workload import as_lists, edge_numbers, needs_python, Workload
+from mddag_executor.recording.joins import sort_by
+from mddag_executor.recording.recorded_jobs import Jobs
+from mddag_executor.simulate.workload import edge_numbers, needs_python, Workload
+import numpy as np
 
 
 class Durations:
     """
     Times of jobs; all times are in ns, vertices are global.
 
-    :ivar recorded: whether the load is recorded; if not, messages take no time.
+    :param jobs: the jobs of the recording that the load is of; None: it is not recorded, and
+        every job takes the same times.
     """
 
-    def __init__(self, tables: Tables, load: Workload, recorded: bool) -> None:
-        self.recorded = recorded
-        self._tables = tables
-        self._load = load = as_lists(load)
-        self._releases: list[list[tuple[int, int]]] = [[] for _ in range(tables.n_dags)]
-        for dag, job, release in zip(load.dags, load.jobs, load.releases or load.times):
-            if dag < tables.n_dags:
-                self._releases[dag].append((release, job))
-        for rows in self._releases:
-            rows.sort()
+    def __init__(self, tables: Tables, load: Workload, jobs: Jobs | None = None) -> None:
+        self._tables, self._load = tables, load
+        releases = [np.zeros(1, dtype=np.int64) if jobs is None else jobs.release[jobs.of_dag(dag)]
+                    for dag in range(tables.n_dags)]
+        #: By DAG the rows of its jobs in the load, in the order of their releases.
+        self._rows = [sort_by(each) for each in releases]
+        #: By DAG the recorded releases, in order.
+        self._releases: list[list[int]] = [
+            [] if jobs is None else each[rows].tolist()
+            for each, rows in zip(releases, self._rows)]
         self._edges = edge_numbers(tables)
         self._values = cache(self._values_of_jobs)
 
     def first_release(self, dag: int) -> int | None:
         """Return when the first job of a DAG was released in the recording; None: unknown."""
-        rows = self._releases[dag]
-        return rows[0][0] if rows and self.recorded else None
+        return next(iter(self._releases[dag]), None)
 
     def execution(self, vertex: int, release: int) -> int:
         """Return how long a vertex of the job with that release executed."""
@@ -56,18 +59,18 @@ class Durations:
 
     def computed(self, vertex: int, release: int) -> int:
         """Return the CPU time that a vertex of the job with that release took."""
-        return self._value('computed' if self._load.computed else 'costs', vertex, release)
+        return self._value('computed' if len(self._load.computed) else 'costs', vertex, release)
 
     def transport(self, before: int, after: int, release: int) -> int:
         """Return how long after the end of a vertex its message arrived."""
         edge = self._edges.get((before, after))
-        if edge is None or not self.recorded:
+        if edge is None or not len(self._load.delays):
             return 0
         return max(0, self._value('delays', before, release, edge))
 
     def holds(self, vertex: int) -> bool:
         """Return whether a vertex held the interpreter in most jobs."""
-        *held, _ = self._values('holds', vertex, None) if self._load.holds else [0]
+        *held, _ = self._values('holds', vertex, None) if len(self._load.holds) else [0]
         return 2 * sum(held) > len(held)
 
     @property
@@ -87,19 +90,19 @@ class Durations:
         """
         load, dag = self._load, self._tables.dag_of[vertex]
         first = load.cost_base[dag] + vertex - self._tables.first_vertex[dag]
-        stride, values = load.cost_stride[dag], getattr(load, column)
+        stride = load.cost_stride[dag]
         if edge is not None:
             first, stride = load.delay_base[dag] + edge, load.delay_stride[dag]
-        found = [values[first + job * stride] for _, job in self._releases[dag]]
-        known = sorted(value for value in found if value < NEVER)
+        found = np.asarray(getattr(load, column))[first + self._rows[dag] * stride]
+        known = np.sort(found[found < NEVER]).tolist()
         median = quantile(known, 0.5) if known else 0
-        return [*(value if value < NEVER else median for value in found), median]
+        return [*np.where(found < NEVER, found, median).tolist(), median]
 
     def _row(self, dag: int, release: int) -> int:
         """Return the place of the recorded job that was released about then; -1: there is none."""
-        rows = self._releases[dag]
-        place = bisect_left(rows, (release,))
-        near = [i for i in (place - 1, place) if 0 <= i < len(rows)]
-        row = min(near, key=lambda i: abs(rows[i][0] - release), default=-1)
-        is_near = row >= 0 and abs(rows[row][0] - release) * 2 <= self._tables.period[dag]
+        releases = self._releases[dag]
+        place = bisect_left(releases, release)
+        near = [i for i in (place - 1, place) if 0 <= i < len(releases)]
+        row = min(near, key=lambda i: abs(releases[i] - release), default=-1)
+        is_near = row >= 0 and abs(releases[row] - release) * 2 <= self._tables.period[dag]
         return row if is_near else -1

@@ -13,7 +13,8 @@ from mddag_executor.executor.compat import (
     heritage_of_response,
     QuickCallback,
 )
-from mddag_executor.executor.tasks import make_task, TaskEntity, Unclaimed
+from mddag_executor.executor.recorder import Recorder
+from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed
 from mddag_executor.executor.work import Work
 from mddag_executor.hosting.guest import Guest
 from mddag_executor.hosting.host import Host
@@ -26,13 +27,12 @@ class NodeHolder(BareExecutor):
     """
     The executor of the nodes of a run.
 
-    :ivar task_entities: what the run keeps for tasks, and for those that inherit, which do not
-        wait behind the others.
+    :param recorder: records the functions of tasks; None: the run is not recorded.
     """
 
-    def __init__(self, context: Any, loop: Loop) -> None:
+    def __init__(self, context: Any, loop: Loop, recorder: Recorder | None) -> None:
         super().__init__(context=context)
-        self.task_entities = (TaskEntity(), TaskEntity())
+        self._task_entities = TaskEntities(recorder)
         self._loop = loop
         self._unclaimed = Unclaimed(lambda error: None)  # none is kept
 
@@ -53,9 +53,9 @@ class NodeHolder(BareExecutor):
             loop.call_in_run(lambda: loop.engine.resume(work, loop.now))
 
         heritage = heritage_of_response(args) or loop.heritage(of_task=True)
-        entity = self.task_entities[heritage is not None]
         task, work = make_task(
-            entity, self, resume, self._unclaimed, None, callback, args, kwargs)
+            self._task_entities.of(callback, args), self, resume, self._unclaimed, None, callback,
+            args, kwargs)
         work.heritage = heritage
         loop.call_in_run(lambda: loop.engine.posted(work, loop.now))
         return task

@@ -158,10 +158,10 @@ def open_input(
 
 
 def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
-    return Durations(Tables.build(task_set), periodic_workload(task_set, times, 1), recorded=False)
+    return Durations(Tables.build(task_set), periodic_workload(task_set, times, 1))
 
 
 def _recorded(run: Recording, task_set: TaskSet) -> Durations:
     tables = Tables.build(task_set, max_active_jobs=NEVER)
     builder = LoadBuilder(run, tables, run.run.head.workers)
-    return Durations(tables, builder.build().load, recorded=True)
+    return Durations(tables, builder.build().load, run.jobs)

@@ -161,7 +161,6 @@ class Rerun:
             engine, self.times, self.cpus, bool(self._holders) and self.times.python,
             recording.start, recording.end, recording.pauses,
             self._refresh, self._begin, self._over)
-        self._holder = NodeHolder(context, loop)
         clock = _TraceTime(loop)
         self._recorder = None
         if writer is not None:
@@ -169,8 +168,8 @@ class Rerun:
                 writer.path, task_set, self.policy, self._workers, DEFAULT_DEADLINE_NS,
                 MAX_ACTIVE_JOBS, clock, writer, self.cpus or 0,
                 on_late=engine.on_late)
-            self._recorder.entities((), self._holder.task_entities)
             engine.recorder = self._recorder
+        self._holder = NodeHolder(context, loop, self._recorder)
         self._registry = Registry(task_set, engine, engine.leave_group, self._recorder)
         self._messages = Messages(loop, recording, self.times, self._outputs, clock)
         self._requests = Requests(loop, self._holder, self._registry)

@@ -23,7 +23,7 @@ class ResponseParts(TypedDict):
     release_lag_ns: int
     """From the release until the source was ready."""
     waiting_ns: int
-    """Ready callbacks waited for a worker, or for their callback group."""
+    """Ready callbacks waited for a worker, for their callback group, or for their program."""
     executing_ns: int
     """Callbacks ran, until they published or ended."""
     suspended_ns: int
@@ -34,6 +34,8 @@ class ResponseParts(TypedDict):
     """Before the first callback of the chain that is recorded."""
     waiting_group_ns: int
     """Part of `waiting_ns`: another callback of the group ran."""
+    waiting_program_ns: int
+    """Part of `waiting_ns`: another callback of a program ran that runs one at a time."""
 
 
 class ChainLink(TypedDict):
@@ -51,6 +53,12 @@ class ChainLink(TypedDict):
     """How long it ran, without the waiting of a coroutine; null if it did not complete."""
     waiting_group_ns: int | None
     """How long other callbacks of its group ran while it waited; null if it did not complete."""
+    waiting_program_ns: int | None
+    """
+    How long other callbacks of its program, which runs one at a time, ran while it waited.
+
+    Null if it did not complete.
+    """
 
 
 class WorstJob(ResponseParts):
@@ -130,6 +138,8 @@ class CallbackUse(MeasuredUse):
     """The longest such time."""
     waiting_group_ns: int
     """Part of `waiting_ns`: another callback of its group ran."""
+    waiting_program_ns: int
+    """Part of `waiting_ns`: another callback of its program ran, which runs one at a time."""
 
 
 class OverTime(TypedDict):
@@ -167,7 +177,18 @@ class Stall(TypedDict):
     """The number of misses that it caused."""
 
 
-class Misses(TypedDict):
+class MissesRare(TypedDict, total=False):
+    """Keys about misses that only some recordings have."""
+
+    interpreter_assumed: int
+    """
+    Misses by the interpreter for which it is not recorded whether the callbacks that ran held it.
+
+    Only if there are any: in recordings of version 2, undeclared callbacks may have held it.
+    """
+
+
+class Misses(MissesRare):
     """The missed deadlines and their causes."""
 
     missed: int

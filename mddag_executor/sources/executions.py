@@ -244,7 +244,8 @@ class ExecutionJoin:
         self._executions.more(
             len(dispatch), callback=dispatch['callback'], dag=dag, vertex=vertex,
             job=dispatch['job'], worker=dispatch['worker'], thread=thread, ready=ready,
-            began=start, start=start,
+            began=start, start=start, cpu=dispatch['cpu_time'],
+            holds_gil=dispatch['held_interpreter'],
             inherited=np.where(dag < 0, dispatch['reference_deadline'], 0))
         self._dispatches.add(thread, dispatch.place, np.arange(before, len(self._executions)))
 

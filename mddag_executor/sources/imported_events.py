@@ -64,7 +64,8 @@ OWN_KINDS: dict[str, tuple[Any, ...]] = {
 The same for a trace of this executor without declaration.
 
 `callback_start` and `rcl_publish` are not in it: they say the same as `dispatch` and
-`rclcpp_publish`, with which they are recorded.
+`rclcpp_publish`, with which they are recorded.  Column ``d`` of a `dispatch` is what ``computed``
+takes apart.
 """
 
 _INIT_TIME = 'init_timestamp'
@@ -89,6 +90,11 @@ class Events(NamedTuple):
     others: list[Event]
     warning: str
     names: Mapping[tuple[int, int], str] = {}
+
+
+def computed(packed: Ints) -> tuple[Ints, Ints]:
+    """Return CPU times, -1: unknown, and whether the GIL was held, from columns ``d``."""
+    return packed // 2 - 1, packed % 2
 
 
 def moved(events: Events, shift: Mapping[int, int]) -> Events:
@@ -195,4 +201,6 @@ def _normal(events: Any, places: Ints, kind: tuple[Any, ...]) -> Table:
             if field in (events.dtype.names or ()):
                 value = events[field].astype(np.int64)
                 found[name] = np.where(value != 0, value, found[name])
+    if kind[0] == START and 'cpu_time' in (events.dtype.names or ()):
+        found['d'] = 2 * (events['cpu_time'] + 1) + (events['held_interpreter'] != 0)
     return found

@@ -28,7 +28,10 @@ Events are named by their position in the order of time.
 4. *Several messages of an execution.*  If an execution publishes a topic several times, the
    callbacks after it run several times in the job.  A vertex completes with the last of them; the
    earlier ones count like messages of a sync that are only stored (`LEG`).
-5. *Driven syncs* (`driven_by`).  The message of the driving topic belongs to a job; the execution
+5. *Skipped releases.*  If it is recorded when a timer was due (`undeclared_run`), a release that
+   was skipped because the execution before it had not started is a job that expires at once, as in
+   a run with a declaration.  It comes right after the job of that execution.
+6. *Driven syncs* (`driven_by`).  The message of the driving topic belongs to a job; the execution
    that answers it (`core.driven`) completes the vertex, and belongs to the job as well.
 """
 
@@ -40,7 +43,7 @@ from typing import NamedTuple
 from mddag_executor.core import EXPIRE_AFTER_NS, legs_of, Tables
 from mddag_executor.core.driven import Awaiting
 from mddag_executor.core.tables import DRIVEN
-from mddag_executor.recording.columns import Ints, Mask, rows, Table
+from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
 from mddag_executor.recording.joins import distinct, equal_pairs, groups, rows_by, sort_by
 from mddag_executor.recording.mapping import Target
 from mddag_executor.recording.tables import (
@@ -60,6 +63,11 @@ _NEVER = 2 ** 62
 """A position after all events."""
 _ANY = -2
 """Instead of a vertex: any of them."""
+SKIPPED = np.dtype([('after', 'i8'), ('release', 'i8'), ('noticed', 'i8')])
+"""
+Columns of a skipped release: the row of the release before it, when it was due, and when it was
+noticed.
+"""
 
 
 class _Job(NamedTuple):
@@ -161,7 +169,7 @@ class ImportedJobs:
             column[:] = column[self._first]
 
     def _answer(self) -> bool:
-        """Find the executions that answer driven syncs (rule 5); return whether there are more."""
+        """Find the executions that answer driven syncs (rule 6); return whether there are more."""
         before = int(self._answers.sum())
         runs, messages = self._links.runs, self._links.messages
         names = [*self._links.topics, '']
@@ -204,12 +212,13 @@ class ImportedJobs:
                     self._vertex[run], self._row[run] = answered
         return int(self._answers.sum()) > before
 
-    def fill(self, table: Table, release: Ints, last: Mask) -> None:
+    def fill(self, table: Table, release: Ints, last: Mask, skipped: Table) -> None:
         """
         Fill in the jobs of executions, and find the ends of jobs.
 
         :param release: of each job.
         :param last: by run of a callback whether its execution ends with it.
+        :param skipped: skipped releases: ``SKIPPED``.
         """
         runs, known = self._links.runs, self._row >= 0
         self.releases['release'] = release
@@ -238,6 +247,43 @@ class ImportedJobs:
         rank[sort_by(at)] = np.arange(1, len(at) + 1)
         self.ends['order'], self.releases['order'], table['order'][done] = np.split(
             rank, np.cumsum([len(ends), len(release)]))
+        if len(skipped):
+            self._add_skipped(table, skipped)
+
+    def _add_skipped(self, table: Table, skipped: Table) -> None:
+        """Add the jobs of skipped releases (rule 5), and number all jobs."""
+        skipped = skipped[sort_by(self.releases['order'][skipped['after']], skipped['release'])]
+        after = skipped['after']
+        # the release and the end of each follow that release in the order of all events
+        place = self.releases['order'][after] + 2 * np.arange(len(skipped)) + 1
+        before = self.releases['order'][after]
+        for of in (self.releases, self.ends, table):
+            of['order'] += np.where(
+                of['order'] >= 0, 2 * np.searchsorted(before, of['order']), 0).astype(
+                    of['order'].dtype)
+        dag = self.releases['dag'][after]
+        ended = self._rows_of(self.ends)
+        releases = concatenate([self.releases, rows(
+            RELEASES, len(skipped), dag=dag, release=skipped['release'],
+            noticed=skipped['noticed'], order=place)])
+        for mine in rows_by(releases['dag'], len(self._dags)):
+            mine = mine[sort_by(releases['order'][mine])]
+            releases['job'][mine] = np.arange(len(mine))
+        known = self._row >= 0
+        table['job'][known] = releases['job'][self._row[known]]
+        self.ends['job'] = releases['job'][ended]
+        ends = concatenate([self.ends, rows(
+            JOB_ENDS, len(skipped), dag=dag, job=releases['job'][len(self.releases):],
+            time=skipped['noticed'], reason=EXPIRED, order=place + 1)])
+        self.releases = releases[sort_by(releases['order'])]
+        self.ends = ends[sort_by(ends['order'])]
+
+    def _rows_of(self, ends: Table) -> Ints:
+        """Return the rows of ``releases`` of ended jobs."""
+        found = np.full(len(ends), UNKNOWN)
+        for dag, mine in enumerate(rows_by(ends['dag'], len(self._dags))):
+            found[mine] = self._jobs[dag][ends['job'][mine]]
+        return found
 
     def _whole(self, done: Ints) -> Mask:
         """Return whether executions complete their vertices: the last leg of a sync does."""

@@ -53,7 +53,7 @@ from mddag_executor.sources.imported_events import (
     read_events,
     START,
 )
-from mddag_executor.sources.imported_jobs import ImportedJobs
+from mddag_executor.sources.imported_jobs import ImportedJobs, SKIPPED
 from mddag_executor.sources.links import Links, Oddities
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
@@ -149,7 +149,7 @@ class ImportedRun:
         first, last = self._pieces()
         jobs = ImportedJobs(self.task_set, links, targets, first, self._clocks.distrusted)
         table['ready'], release = self._times(jobs)
-        jobs.fill(table, release, last)
+        jobs.fill(table, release, last, self._skipped(jobs))
         self._number_pieces(table)
         unfinished, places = self._end_unfinished(table)
         run = Run(
@@ -215,6 +215,10 @@ class ImportedRun:
 
     def _number_pieces(self, table: Table) -> None:
         """Do nothing: each execution has one piece."""
+
+    def _skipped(self, jobs: ImportedJobs) -> Table:
+        """Return the releases that are known to be skipped: none, without due times."""
+        return rows(SKIPPED)
 
     def _completed(self, found: Recording) -> Recording:
         """Return the recording with what other events say."""

@@ -23,9 +23,14 @@ the causes of executions.  Differences:
    excludes, that of the least total lateness is chosen.  If every origin is excluded, or none is
    and few releases were noticed soon, the timer kept no grid: a release is the time at which it
    was noticed.
+   If the next due time is more than a period later, the due times in between up to the start of
+   the execution were skipped, as in a run with a declaration: the timer could not wait a second
+   time.  Those after the last execution of a timer are not known: it may have been cancelled.
 4. The pieces of a coroutine became ready at the same time.  They are one execution, which
    completes at the end of the last piece.
-5. The start of an execution is recorded when it ends.  That of one that has not ended is in
+5. ``dispatch`` is recorded when the execution has ended, with its CPU time and whether its
+   callback holds the interpreter.  Version 2 did not record that.
+6. The start of an execution is recorded when it ends.  That of one that has not ended is in
    ``unfinished``.
 """
 
@@ -34,6 +39,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+from mddag_executor.core.tables import MOST_SKIPPED
 from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Table
 from mddag_executor.recording.joins import as_of, distinct, rows_by, sort_by
 from mddag_executor.recording.losses import Loss
@@ -43,6 +49,7 @@ from mddag_executor.sources.entities import INIT_EVENTS, signed
 from mddag_executor.sources.executions import number_pieces
 from mddag_executor.sources.head import no_end, steps
 from mddag_executor.sources.imported_events import (
+    computed,
     END,
     Events,
     OWN_KINDS,
@@ -50,7 +57,7 @@ from mddag_executor.sources.imported_events import (
     START,
     TAKE,
 )
-from mddag_executor.sources.imported_jobs import ImportedJobs
+from mddag_executor.sources.imported_jobs import ImportedJobs, SKIPPED
 from mddag_executor.sources.imported_run import ImportedRun, OFF_THE_GRID
 from mddag_executor.sources.links import Links
 from mddag_executor.sources.stamps import find_stamps, Sent
@@ -142,11 +149,11 @@ class UndeclaredRun(ImportedRun):
     odd = {**OFF_THE_GRID, 'off': (
         'execution', 'of timers whose due times are not recorded and that kept to no period '
         '(reset, or by another clock): released when they were noticed'), 'skipped': (
-        'release', 'of timers skipped, as the one before began later than they were due: without '
-        'a job, so they do not count as missed')}
+        'release', 'of undeclared timers skipped, as the one before began later than they were '
+        'due')}
 
     def _with_unfinished(self, events: Events) -> Events:
-        """Add the starts of executions that have not ended (rule 5)."""
+        """Add the starts of executions that have not ended (rule 6)."""
         found: dict[tuple[int, int, int], tuple[int, int, str]] = {}
         #: By thread, address and start of an unfinished execution: ready, worker, where it was.
         self._found = found
@@ -193,6 +200,11 @@ class UndeclaredRun(ImportedRun):
 
     def _places(self, mine: Ints) -> list[str]:
         return [where for _, _, where in self._unfinished(mine)]
+
+    def _executions(self) -> Table:
+        table = super()._executions()
+        table['cpu'], table['holds_gil'] = computed(self._events.table['d'][self.links.runs['at']])
+        return table
 
     def _number_pieces(self, table: Table) -> None:
         number_pieces(table, np.arange(len(table)), 'callback', table['completes'] == NOTHING)
@@ -243,9 +255,6 @@ class UndeclaredRun(ImportedRun):
             times = distinct(ready[mine[due[mine] == 0]])
             if callback.kind == 'timer' and len(times):
                 callback.grid = _grid(times, callback.period)
-            if callback.kind == 'timer':
-                self._odd.count('skipped', callback.label, self._skipped(
-                    mine[due[mine] > 0], callback.period))
         # the time at which a request was taken is not recorded
         release = self._releases(jobs, ready, 'timer', 'service')
         timer = self._is_any('timer')[number[jobs.sources]]
@@ -254,14 +263,34 @@ class UndeclaredRun(ImportedRun):
         release[timer] = self._due(mine, ready[mine])
         return ready, np.where(due[jobs.sources] > 0, due[jobs.sources], release)
 
-    def _skipped(self, which: Ints, period: int) -> int:
-        """Return how many releases of a timer were skipped because of late executions."""
-        due, first = np.unique(self.links.runs['due'][which], return_index=True)
-        if period <= 0 or len(due) < 2:
-            return 0
-        gaps = np.rint(np.diff(due) / period).astype(np.int64) - 1  # also while it was cancelled
-        late = (self.links.runs['start'][which[first]] - due)[:-1] // period
-        return int(np.maximum(0, np.minimum(gaps, late)).sum())
+    def _skipped(self, jobs: ImportedJobs) -> Table:
+        """Return the releases of sources that were skipped (rule 3); count those of others."""
+        runs, found = self.links.runs, [rows(SKIPPED)]
+        row = np.full(len(runs), UNKNOWN)
+        row[jobs.sources] = np.arange(len(jobs.sources))
+        once = np.array([*(dag.vertices[dag.source].callback.once for dag in self.task_set.dags),
+                         False])
+        for callback, mine in zip(
+                self.links.callbacks, rows_by(runs['callback'], len(self.links.callbacks))):
+            mine = mine[runs['due'][mine] > 0]
+            if callback.kind != 'timer' or callback.period <= 0 or len(mine) < 2:
+                continue
+            due, first = np.unique(runs['due'][mine], return_index=True)
+            gaps = np.rint(np.diff(due) / callback.period).astype(np.int64) - 1
+            mine, due = mine[first[:-1]], due[:-1]
+            # it may have been cancelled in the rest of a gap
+            skipped = np.minimum(gaps, (runs['start'][mine] - due) // callback.period)
+            if (row[mine] < 0).any():
+                self._odd.count('skipped', callback.label, int(skipped.clip(0).sum()))
+                continue
+            skipped[once[jobs.releases['dag'][row[mine]]]] = 0
+            number = np.minimum(skipped.clip(0), MOST_SKIPPED)
+            mine, due, last = (np.repeat(each, number) for each in (mine, due, skipped))
+            back = np.arange(len(mine)) - np.repeat(np.cumsum(number) - number, number)
+            release = due + (last - back) * callback.period
+            found.append(rows(SKIPPED, len(mine), after=row[mine], release=release,
+                              noticed=np.maximum(release, runs['ready'][mine])))
+        return concatenate(found)
 
     def _pieces(self) -> tuple[Ints, Mask]:
         """Return the first pieces of executions, and which end them (rule 4)."""

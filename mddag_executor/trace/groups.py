@@ -32,7 +32,8 @@ _VALUES = {
 
 GROUPS = {
     EXECUTION: {
-        'mddag:dispatch': 'start callback dag vertex job worker ready deadline none',
+        'mddag:dispatch':
+            'start callback dag vertex job worker ready deadline none unknown none',
         'ros2:callback_start': 'start callback none',
         'ros2:callback_end': 'end callback',
         'mddag:complete':
@@ -66,11 +67,11 @@ class Group:
         heads = [
             struct.pack('<BQH', Opcode.MESSAGE, size - records.RECORD.size, part.number)
             for size, part in zip(self.sizes, self.parts)]
-        self._constants = (*heads, cdr.ENCAPSULATION, 0)
+        self._constants = (*heads, cdr.ENCAPSULATION, 0, -1)
         # the names of what ``encode`` puts together, and of that what each message consists of
         n = range(len(self.parts))
         values = ['name', *_VALUES[name].split()]
-        names = [*values, 'vpid', *(f'head {i}' for i in n), 'cdr', 'none',
+        names = [*values, 'vpid', *(f'head {i}' for i in n), 'cdr', 'none', 'unknown',
                  *(f'sequence {i}' for i in n)]
         self._length = len(values)
         picked, times = list[str](), list[str]()

@@ -78,10 +78,11 @@ def test_a_job_to_the_millisecond(trace):
     assert {key: value // MS for key, value in worst.items() if key.endswith('_ns')} == {
         'release_ns': START_TIME // MS + 10, 'completed_ns': START_TIME // MS + 25,
         'release_lag_ns': 1, 'waiting_ns': 1 + 1 + 2, 'executing_ns': 2 + 3 + 3,
-        'suspended_ns': 0, 'transport_ns': 1 + 1, 'unknown_ns': 0, 'waiting_group_ns': 0}
+        'suspended_ns': 0, 'transport_ns': 1 + 1, 'unknown_ns': 0, 'waiting_group_ns': 0,
+        'waiting_program_ns': 0}
     assert result['callbacks']['/fuse:join'] == {
         'executions': 2, 'busy_ns': 4 * MS, 'longest_ns': 3 * MS, 'waiting_ns': 2 * MS,
-        'longest_wait_ns': 2 * MS, 'waiting_group_ns': 0}
+        'longest_wait_ns': 2 * MS, 'waiting_group_ns': 0, 'waiting_program_ns': 0}
     assert result['dags']['/imu']['jobs'] == 0
 
 

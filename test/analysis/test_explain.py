@@ -121,6 +121,14 @@ def test_the_right_cause_is_told(cause, tmp_path):
         if job['verdict'] == 'late':
             assert sum(part['ns'] for part in job['parts']) == job['until_ns'] - job['release_ns']
             assert cause in [part['cause'] for part in job['parts']]
+    if cause in ('group', 'program'):   # the tables of response times say the same
+        outcome = replay(trace.path)
+        usage = outcome.usage.callbacks()['/victim:use']
+        worst = outcome.result()['dags']['/sensor']['sinks']['/victim:use']['breakdown']['worst']
+        for name in ('group', 'program'):
+            expected = 25 * MS if name == cause else 0
+            assert (usage[f'waiting_{name}_ns'], worst[f'waiting_{name}_ns']) == (
+                expected * JOBS // 5, expected)
     if cause in ('waited', 'group', 'program', 'interpreter') and not special:
         behind = {each['callback'] for job in result['jobs'] for part in job['parts']
                   if part['cause'] == cause for each in part['behind'] if each['ns'] > 5 * MS}

@@ -89,7 +89,8 @@ def test_chains(outcome):
                 worst = found['breakdown']['worst']
                 links = [{'vertex': row['vertex'], 'ready_ns': row['ready'],
                           'start_ns': row['start'], 'end_ns': row['end'], 'busy_ns': row['busy'],
-                          'waiting_group_ns': row['waiting_group']}
+                          'waiting_group_ns': row['waiting_group'],
+                          'waiting_program_ns': row['waiting_program']}
                          for row in chains.get((dag, sink, worst['job']), [])]
                 assert links == worst['chain']
 

@@ -139,8 +139,8 @@ nodes:
     load, run = runs.simulated(task_set, ms=400, workers=1, utilisation=0.45)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     outcome = replay(tmp_path / 'run.mcap')
-    assert {sink: name for (sink, _), name in outcome.explanation.longest_behind().items()} == {
-        1: '/a:slow'}
+    waited = outcome.table('causes')
+    assert {*zip(waited['sink'].tolist(), waited['behind'].tolist())} == {(1, '/a:slow')}
     text = written(html.of_outcome(outcome))
     misses = text[text.index('id="mddag-misses"'):text.index('id="mddag-sinks"')]
     assert '>mostly behind<' in misses

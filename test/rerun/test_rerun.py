@@ -19,6 +19,9 @@ from mddag_executor import open_recording, replay
 from mddag_executor.core import Tables
 from mddag_executor.errors import UsageError
 from mddag_executor.laboratory.generate import generate, Options
+from mddag_executor.recording.columns import rows
+from mddag_executor.recording.recorded_jobs import Jobs
+from mddag_executor.recording.tables import RELEASES
 from mddag_executor.rerun import assert_same, CallbackFailed, compare, programs, rerun, RerunError
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.inputs import MessageBag, open_input
@@ -221,13 +224,29 @@ def test_recorded_publications_belong_to_their_executions(bag, graph, tmp_path, 
     assert by == 20 * ['/filter:take', '/sink:take']
 
 
+def test_tasks_have_the_names_of_their_functions(bag, graph, tmp_path):
+    def plan():
+        pass
+
+    def take(node, number):
+        node.executor.create_task(plan)
+
+    trace = str(tmp_path / 'run.mcap')
+    run_filter(bag, graph, take, Sink, trace=trace)
+    run = open_recording(trace)
+    names = {run.callback_name(each) for each in run.executions['callback'].tolist()}
+    assert 'plan (task)' in {name.rpartition('.')[2] for name in names}
+    assert not any('callback (task)' in name for name in names)
+
+
 @pytest.mark.parametrize(('delay_ms', 'out_ms'), [(4, 24), (-4, 20)])
 def test_messages_leave_at_the_end_and_take_their_recorded_time(bag, graph, delay_ms, out_ms):
     """Each callback takes 10 ms; what was recorded before a callback's end arrives at the end."""
     task_set = load(str(graph))
     recorded = Workload([0], [0], [0], [0, 10 * MS, 10 * MS], [0], [0],
                     delays=[0, delay_ms * MS], delay_base=[0], delay_stride=[0])
-    times = Durations(Tables.build(task_set), recorded, recorded=True)
+    jobs = Jobs(1, rows(RELEASES, 1))
+    times = Durations(Tables.build(task_set), recorded, jobs)
     result = Rerun(MessageBag(bag), times, task_set, workers=2).run(
         lambda: programs([Filter, Sink]))
     assert [time for time, _ in published(result, '/filtered')][:2] == [10, 110]

@@ -9,9 +9,11 @@ from pathlib import Path
 
 from hypothesis import given
 from hypothesis import strategies as st
+from mddag_executor import replay
 from mddag_executor.sources import stamps_without_numbers
 from mddag_executor.sources.stamps import find_stamps, Sent
 from mddag_executor.trace import EVENTS, TraceFile, TraceReader
+from msg_graph import loads
 import numpy as np
 import pytest
 
@@ -304,17 +306,40 @@ def test_a_recorded_due_time_is_the_release(run):
     assert sink['breakdown']['mean']['release_lag_ns'] == 13.5 * MS
 
 
-def test_skipped_releases_of_timers_are_no_jobs_and_a_warning_counts_them(run):
+def test_skipped_releases_of_timers_expire_as_in_a_run_with_a_declaration(run):
     # the first execution is late by 2.5 periods; then the timer is cancelled for a while
-    for due, start in ((0, 250), (300, 301), (400, 401), (1200, 1201)):
-        run.runs(GRAB, start, start + 2, start + 1, due=due)
+    for due, start, ready in ((0, 250, 120), (300, 301, 300), (400, 401, 400), (1200, 1201, 1200)):
+        run.runs(GRAB, start, start + 2, start + 1, due=due, ready=ready)
         run.detects(start + 1, 1)
     result = run.result(1300)
     sink = of_camera(result)
-    assert (sink['completed'], sink['late']) == (4, 1)
-    warning, = result['warnings']
-    assert ': 2 releases of timers skipped, as the one before began later' in warning
-    assert warning.endswith('/camera timer 100ms (2)')
+    assert (sink['completed'], sink['late'], sink['expired']) == (4, 1, 2)
+    assert result['dags']['/camera']['jobs'] == 6
+    assert not result['warnings']
+    replayed = replay(run.path, loads(GRAPH))
+    jobs = replayed.recording.jobs
+    mine = jobs.of_dag(0)
+    assert jobs.number[mine].tolist() == [*range(6)]
+    assert ((jobs.release[mine] - ns(0)) // MS).tolist() == [0, 100, 200, 300, 400, 1200]
+    # that of 100 ms was noticed with the one before, that of 200 ms when it was due
+    assert ((jobs.noticed[mine] - ns(0)) // MS).tolist()[1:3] == [120, 200]
+    assert [(each['job'], each['cause']) for each in replayed.explanation.result()['jobs']
+            if each['job'] in (1, 2)] == [(1, 'machine'), (2, 'machine')]   # nothing ran
+    assert [part['waiting_job'] for each in replayed.explanation.result(job=1)['jobs']
+            for part in each['parts']] == [0]
+
+
+def test_skipped_releases_of_undeclared_timers_are_counted(run):
+    for due, start in ((0, 250), (300, 301), (400, 401)):
+        run.runs(SCAN, start, start + 2, start + 1, due=due)
+    run.graph.write_text(GRAPH.replace(
+        '  - {node: /radar, callbacks: [{name: scan, timer: 100ms, publishes: [/image]}]}\n', ''))
+    for job in range(4):
+        run.runs(GRAB, job * 100, job * 100 + 2, job * 100 + 1, due=job * 100)
+        run.detects(job * 100 + 1)
+    warning, = run.result(500)['warnings']
+    assert ': 2 releases of undeclared timers skipped, as the one before began later' in warning
+    assert warning.endswith('/radar timer 100ms (2)')
 
 
 def test_actions_and_dropped_messages_are_no_damage(run):

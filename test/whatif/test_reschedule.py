@@ -157,7 +157,7 @@ nodes:
     result = replay(path).result()
     assert result['callbacks']['/n:a'] == {
         'executions': 1, 'busy_ns': 5 * MS, 'longest_ns': 5 * MS, 'waiting_ns': 0,
-        'longest_wait_ns': 0, 'waiting_group_ns': 0}
+        'longest_wait_ns': 0, 'waiting_group_ns': 0, 'waiting_program_ns': 0}
     worst = result['dags']['a']['sinks']['/n:b']['breakdown']['worst']
     assert (worst['suspended_ns'], worst['executing_ns']) == (18 * MS, 5 * MS + 6 * MS)
     assert reschedule(path).warnings == [

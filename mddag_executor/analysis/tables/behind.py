@@ -10,12 +10,11 @@ import numpy as np
 
 
 def _make(replay: Replayed) -> Table:
-    found = [(part, name, time) for part, waits in replay.explanation.behind().items()
-             for name, time in waits]
+    found = replay.explanation.behind
     return Table({
-        'part': np.array([part for part, _, _ in found], dtype=np.int64),
-        'callback': np.array([name for _, name, _ in found], dtype=object),
-        'time': np.array([time for _, _, time in found], dtype=np.int64)})
+        'part': found['part'],
+        'callback': np.array(replay.explanation.names_of(found['callback']), dtype=object),
+        'time': found['ns']})
 
 
 TABLE = ResultTable('behind', 'callback that ran while a part of a missed job waited', {

@@ -19,7 +19,7 @@ import numpy as np
 
 
 def _make(replay: Replayed) -> Table:
-    found, behind = replay.explanation.found, replay.explanation.longest_behind()
+    found = replay.explanation.found
     missed, tables = found.misses, replay.judged.tables
     sink = missed['sink']
     deadline = np.array([*tables.sink_deadline, 0], dtype=np.int64)[sink]
@@ -27,8 +27,8 @@ def _make(replay: Replayed) -> Table:
         'dag': np.array([*tables.dag_of, -1])[sink], 'sink': sink, 'job': missed['job'],
         'verdict': missed['kind'], 'cause': found.causes, 'late': np.where(
             missed['kind'] == SINK_LATE, missed['until'] - missed['release'] - deadline, -1),
-        'reached': missed['at'], 'behind': np.array([behind.get(key, '') for key in zip(
-            sink.tolist(), missed['job'].tolist())], dtype=object)})
+        'reached': missed['at'],
+        'behind': np.array(replay.explanation.longest_behind(), dtype=object)})
 
 
 TABLE = ResultTable('causes', 'missed deadline, in the order of deadlines', {

@@ -17,7 +17,8 @@ def _make(replay: Replayed) -> Table:
         'place': np.arange(len(links)) - np.searchsorted(links['of'], links['of']),
         **{name: links[name] for name in ('vertex', 'ready', 'start')},
         **{name: np.where(ended, links[name], -1) for name in ('end', 'busy')},
-        'waiting_group': links['group'], 'cpu': links['cpu'], 'execution': links['row']})
+        'waiting_group': links['group'], 'waiting_program': links['program'],
+        'cpu': links['cpu'], 'execution': links['row']})
 
 
 TABLE = ResultTable('chains', 'callback on the critical chain of each verdict', {
@@ -31,5 +32,7 @@ TABLE = ResultTable('chains', 'callback on the critical chain of each verdict', 
     'end': Column('when it ended; unknown: it did not complete', 'ns', unknown=-1),
     'busy': Column('how long it ran, without the waiting of a coroutine', 'ns', unknown=-1),
     'waiting_group': Column('how long others of its group ran while it waited', 'ns'),
+    'waiting_program': Column('how long others of its program, which runs one at a time, ran '
+                              'while it waited', 'ns'),
     'cpu': Column('its CPU time, if it was recorded', 'ns', unknown=-1),
     'execution': Column('row of `executions`')}, _make)

@@ -19,9 +19,12 @@ TABLE = ResultTable('response_parts', 'completed job at each sink: where its res
     'release': Column('when the job was released', 'ns'),
     'completed': Column('when the sink was completed', 'ns'),
     'release_lag': Column('from the release until the source was ready', 'ns'),
-    'waiting': Column('ready callbacks waited for a worker, or for their callback group', 'ns'),
+    'waiting': Column('ready callbacks waited for a worker, for their callback group, or for '
+                      'their program', 'ns'),
     'executing': Column('callbacks ran, until they published or ended', 'ns'),
     'suspended': Column('coroutines waited within their executions', 'ns'),
     'transport': Column('from the end of a callback until the next one was ready', 'ns'),
     'unknown': Column('before the first callback of the chain that is recorded', 'ns'),
-    'waiting_group': Column('part of `waiting`: another callback of the group ran', 'ns')}, _make)
+    'waiting_group': Column('part of `waiting`: another callback of the group ran', 'ns'),
+    'waiting_program': Column('part of `waiting`: another callback of a program ran that runs one '
+                              'at a time', 'ns')}, _make)

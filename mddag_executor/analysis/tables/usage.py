@@ -23,6 +23,8 @@ TABLE = ResultTable('usage', 'declared callback; the last row is for all undecla
     'waiting': Column('how long it was ready and had not started', 'ns'),
     'longest_wait': Column('the longest such time', 'ns'),
     'waiting_group': Column('part of `waiting`: another callback of its group ran', 'ns'),
+    'waiting_program': Column('part of `waiting`: another callback of its program ran, which runs '
+                              'one at a time', 'ns'),
     'measured': Column('executions of which the CPU time is known'),
     'measured_busy': Column('how long these ran', 'ns'),
     'cpu': Column('their CPU time', 'ns'),
