@@ -30,7 +30,12 @@ sequence number, and job.  Both processes have the same system clock.
 6.  *Not published.*  If an execution ends without a topic of ``may_publish`` that starts a
     callback elsewhere, that is announced as well, with the sequence number ``SILENT``.  The job is
     opened in a process where it is not open yet, so that its results count as not due there.
-7.  Executors understand each other only if they have the same declaration: its digest is in the
+7.  *Lost.*  A process opens a job as soon as the publication is announced that starts one of its
+    callbacks.  If the message is lost, the job expires there, and its results count as missed.
+8.  *Ended early.*  If a job expires or fails, that is announced with the sequence number
+    ``ENDED``.  It ends then in all processes, also where nothing of it has arrived, so that the
+    results that it owes there count as missed.
+9.  Executors understand each other only if they have the same declaration: its digest is in the
     name of the topic.  Each process has its own topic, so that it does not receive its own
     announcements.
 """
@@ -45,6 +50,7 @@ import struct
 import time
 from typing import Any, TYPE_CHECKING
 
+from mddag_executor.core.state import EXPIRED, FAILED
 from mddag_executor.executor.attribution import (
     Announced,
     header_stamp,
@@ -77,6 +83,9 @@ MOST_ENTRIES = 256
 # sender, publisher, sequence, begin, end; home, number and release of the job; DAG, vertex, topic
 SILENT = 2 ** 64 - 1
 """In place of a sequence number: the topic was not published in the job."""
+ENDED = SILENT - 1
+"""In place of a sequence number: the job has ended early.  The reason replaces the publisher."""
+_EARLY_ENDS = EXPIRED, FAILED
 _ENTRY = struct.Struct('<QQQqqQQqiiI')
 
 
@@ -101,6 +110,8 @@ class Announcements:
         # until when (trace's clock) each message waits, and its info from the middleware
         self._waiting: list[tuple[int, Work, dict[str, Any]]] = []
         self._checked_at = 0
+        # the name of the job that ends because another process says so
+        self._heard: tuple[int, int] | None = None
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
         names = [each.name for each in task_set.processes]
         own = names.index(process)
@@ -118,6 +129,7 @@ class Announcements:
             pool.unlocked_calls, self.subscriptions[0].topic_name if self._n_others else '')
         self._attribution.announce = self._announce
         self._engine.optional_topics.on_silent.append(self._announce_silent)
+        self._engine.verdicts.on_end = self._announce_end
 
     def unmatched(self) -> list[str]:
         """Return the topics on which the processes have not discovered each other."""
@@ -134,6 +146,7 @@ class Announcements:
         if self._publisher is not None:
             self._attribution.announce = None
             self._engine.optional_topics.on_silent.remove(self._announce_silent)
+            self._engine.verdicts.on_end = None
             self._publisher = None
             self.node.destroy_node()
 
@@ -170,6 +183,20 @@ class Announcements:
             self._pool.unlocked_calls.append(
                 partial(publish_as_executor, publisher, UInt8MultiArray(data=entry)))
 
+    def _announce_end(self, dag: int, job: int, end: int) -> None:
+        """Announce that a job has ended early (rule 8); the engine's lock is held."""
+        others, publisher = self._engine.other_processes, self._publisher
+        release = None if others is None else others.ended(dag, job)
+        if release is None or others is None or publisher is None or end not in _EARLY_ENDS:
+            return
+        name = others.name_of(Origin(-1, dag, job, -1)) or (self._token, job)
+        if name == self._heard:
+            return
+        entry = _ENTRY.pack(
+            self._token, _EARLY_ENDS.index(end), ENDED, 0, 0, *name,
+            release - self._clock.offset_ns, dag, self._engine.tables.source[dag], 0)
+        self._pool.unlocked_calls.append(partial(publisher.publish, UInt8MultiArray(data=entry)))
+
     def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
         """Return name and release of a job; None: no job, or it has ended meanwhile."""
         others = self._engine.other_processes
@@ -194,19 +221,28 @@ class Announcements:
         for entry in _ENTRY.iter_unpack(message.data):
             if not self._is_plausible(*entry[-4:]):
                 continue
+            home, number, release, dag, vertex, topic = entry[5:]
+            job = Announced((home, number), dag, vertex, release + self._clock.offset_ns)
             if entry[2] == SILENT:
-                home, number, release, dag, vertex, topic = entry[5:]
-                self._engine.hear_silent(
-                    Announced((home, number), dag, vertex, release + self._clock.offset_ns),
-                    self._topics[topic], self._pool.tick())
+                self._engine.hear_silent(job, self._topics[topic], self._pool.tick())
+            elif entry[2] == ENDED:
+                self._hear_end(job, entry[1])
             else:
                 self._note(*entry)
+                if dag >= 0:
+                    self._engine.hear_published(job, self._topics[topic], self._pool.tick())
         for entry in list(self._waiting):
             origin = self._find(entry[1], entry[2])
             if origin is not None:
                 self._waiting.remove(entry)
                 self._give(entry[1], origin)
         self._allowance.spend(time.thread_time_ns() - begin)
+
+    def _hear_end(self, job: Announced, reason: int) -> None:
+        if job.dag >= 0 and reason < len(_EARLY_ENDS) and isinstance(job.name, tuple):
+            self._heard = job.name
+            self._engine.hear_ended(job, _EARLY_ENDS[reason], self._pool.tick())
+            self._heard = None
 
     def _is_plausible(self, release: int, dag: int, vertex: int, topic: int) -> bool:
         """Return whether an announcement may be true: it comes from outside."""

@@ -409,6 +409,8 @@ class Engine:
         if self._state.decisions:
             self._decided(now)
         self.deadlines.watch(slot)
+        if self.other_processes is not None:
+            self.other_processes.released(dag, job, release)
         self.verdicts.released(dag, job, release, now, is_judged(self._state, slot))
         return slot
 
@@ -799,6 +801,22 @@ class Engine:
             records.run(work, x, start, end, vtid, worker)
         if self.path_watch is not None:
             self.path_watch.left(work)
+
+    def hear_published(self, job: Announced, topic: str, now: int) -> None:
+        """Open the job of a message of another process, which may be lost on its way."""
+        others = self.other_processes
+        if not self._finished and others is not None and others.enters(job.vertex, topic):
+            self._enter(job, min(job.release, now), now)
+
+    def hear_ended(self, job: Announced, end: int, now: int) -> None:
+        """End a job that has ended early in another process."""
+        others = self.other_processes
+        if self._finished or others is None or not others.is_here(job.dag):
+            return
+        origin = self._enter(job, min(job.release, now), now)
+        if origin is not None and self.open_release(origin) is not None:
+            self.scheduler.give_up(origin.slot, end, now)
+        self._decided(now)
 
     def hear_silent(self, job: Announced, topic: str, now: int) -> None:
         """Leave out of a job what an execution in another process has not started."""

@@ -86,6 +86,10 @@ class OtherProcesses:
         self._names: dict[tuple[int, int], tuple[int, int]] = {}
         # by DAG and job: its first stamp
         self._stamps: dict[tuple[int, int], int] = {}
+        # vertices elsewhere and their topics that start vertices here
+        self._entering: set[tuple[int, str]] = set()
+        # by DAG and job: the release of an open job whose end is announced
+        self._releases: dict[tuple[int, int], int] = {}
 
     @staticmethod
     def of(
@@ -137,6 +141,12 @@ class OtherProcesses:
         self._leaving = {
             t for dag in self._dags for v in dag.vertices if self._here[dag.index][v.index]
             for t in v.callback.publishes if self._leaves(dag, v, self._here[dag.index], t)}
+        self._entering = {
+            (self._tables.first_vertex[dag.index] + v.index, t) for dag in self._dags
+            for v in dag.vertices if not self._here[dag.index][v.index]
+            for t in {*v.callback.publishes, *v.callback.may_publish} if any(
+                self._here[dag.index][after] and t in dag.vertices[after].callback.topics
+                for after in v.successors)}
         self._attribution.note_headers(self.note, leaving)
         self._attribution.announce_on(announced)
         for entity in entities:
@@ -219,6 +229,23 @@ class OtherProcesses:
     def find(self, dag: int, name: int | tuple[int, int]) -> Origin | None:
         """Return the job of a stamp or name, also one that has ended; None for a new one."""
         return self._jobs.get((dag, name))
+
+    def enters(self, vertex: int, topic: str) -> bool:
+        """Return whether messages of a vertex elsewhere on a topic start a vertex here."""
+        return (vertex, topic) in self._entering
+
+    def is_here(self, dag: int) -> bool:
+        """Return whether any vertex of a DAG is here."""
+        return any(self._here.get(dag, ()))
+
+    def released(self, dag: int, job: int, release: int) -> None:
+        """Note the release of a job, until it has ended."""
+        if dag in self._announced:
+            self._releases[dag, job] = release
+
+    def ended(self, dag: int, job: int) -> int | None:
+        """Return the release of a job that has ended; None: its end is not announced."""
+        return self._releases.pop((dag, job), None)
 
     def name_of(self, origin: Origin) -> tuple[int, int] | None:
         """Return the name of a job, None if it has none yet."""

@@ -87,6 +87,8 @@ class Verdicts:
         self._on_miss = on_miss
         #: Called with DAG and release of each job that starts.
         self.on_release: Callable[[int, int], None] | None = None
+        #: Called with DAG, number and end of each job that has ended.
+        self.on_end: Callable[[int, int, int], None] | None = None
 
     def add(self, decisions: list[Decision], now: int) -> list[int]:
         """Count decisions of the core; return the executions that it dropped."""
@@ -111,6 +113,8 @@ class Verdicts:
         name = _RECORDED_ENDS.get(end)
         if self.record is not None and name is not None:
             self.record(name, now, threading.get_native_id(), dag, job)
+        if self.on_end is not None:
+            self.on_end(dag, job, end)
 
     def _missed(
         self, kind: int, dag: int, vertex: int, job: int, deadline: int, time: int, now: int,
