@@ -239,6 +239,27 @@ def test_an_undeclared_callback_may_hold_the_interpreter(aborted, tmp_path, call
             'replay', path, '--reschedule').stdout
 
 
+@pytest.mark.parametrize(('computed', 'cause'), [
+    ((), 'interpreter'), ((49 * MS, True), 'interpreter'), ((0, False), 'machine')])
+def test_a_trace_says_whether_an_undeclared_callback_held_the_interpreter(
+        computed, cause, tmp_path, call):
+    """Older ones do not: then it is assumed, and a line says so."""
+    trace = Written(tmp_path / 'run.mcap', TWO, 2)
+    for job in range(5):
+        at = job * 1000
+        trace.piece(-1, -1, -1, at, at + 50, computed=computed)
+        trace.release(1, job, at)
+        trace.run(1, 0, job, at + 50, at + 51, worker=1, ready=at, computed=(MS, True))
+    path = trace.end(5000)
+    result = explained(path)
+    assert result['causes'][cause] == result['missed'] == 5
+    assert result.get('interpreter_assumed', 0) == (0 if computed else 5)
+    text = call('explain', path).stdout
+    assert ('5 of 5 misses by the interpreter are assumed' in text) == (not computed)
+    table = open_recording(path).executions
+    assert {*table['cpu'][table['vertex'] < 0].tolist()} == {computed[0] if computed else -1}
+
+
 def test_a_release_is_skipped_for_what_the_one_before_waited_for(tmp_path):
     # whose result was not due, so that it has no cause of its own; one of two workers is free
     trace = Written(tmp_path / 'run.mcap', VICTIM.replace('publishes', 'may_publish'), 2)

@@ -158,11 +158,17 @@ class Written:
     def release(self, dag, job, at, noticed=None):
         self.add('job_release', at if noticed is None else noticed, dag, job, ns(at))
 
-    def piece(self, dag, vertex, job, start, end, *, ready=None, worker=0, thread=None):
-        """Run a piece of an execution; without `ready` it has not waited."""
+    def piece(
+            self, dag, vertex, job, start, end, *, ready=None, worker=0, thread=None, computed=()):
+        """
+        Run a piece of an execution; without `ready` it has not waited.
+
+        `computed`: if it has no job, its CPU time and whether it held the interpreter.
+        """
         thread, address = 10 + worker if thread is None else thread, 1000 + 100 * dag + vertex
         self.add('dispatch', start, address, dag, vertex, job, worker,
-                 ns(start if ready is None else ready), 0, thread=thread)
+                 ns(start if ready is None else ready), 0, *([0, *computed] if computed else ()),
+                 thread=thread)
         self.add('callback_start', start, address, False, thread=thread)
         self.add('callback_end', end, address, thread=thread)
         return thread, address
