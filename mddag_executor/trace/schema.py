@@ -154,9 +154,8 @@ _ALL = (
     _event('mddag', 'program', callback=_U64, program=_I64),
     _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
-    # of an undeclared execution, the deadline that it inherits, 0: none; if it belongs to no job, the
-    # due time of a timer, 0: unknown, and its CPU time, -1: unknown, and whether its callback holds
-    # the GIL
+    # of an execution that belongs to no job: the deadline that it inherits, 0: none; the due time
+    # of its timer, 0: unknown; its CPU time, -1: unknown; and whether its callback holds the GIL
     _event('mddag', 'dispatch', (0, -1, False), callback=_U64, dag=_I32, vertex=_I32, job=_I64,
            worker=_I32, ready=_I64, reference_deadline=_I64, due=_I64, cpu_time=_I64,
            held_interpreter=_BOOL),
