@@ -35,10 +35,11 @@ NET_NS = 20_000_000
 
 QUIET_NS = 5_000_000
 """
-If no thread had nothing to run for this long, one that rests ends the next look.
+If no thread had nothing to run for this long, one that rests cancels the next look.
 
-In a process with few callbacks this costs less than the look; with many, the look is put off by
-the next callback anyway.
+In a process with few callbacks this costs less than the look.  With many, the look is put off by
+up to ``NET_NS`` instead, so that the next callback need not set it, unless it would not come
+within ``NET_NS`` less this.
 """
 
 LOOK_PART = 4

@@ -210,11 +210,17 @@ class DueTimes:
         if self._interpreter.holders or not self._pool.polling or not self._pool.running:
             self.arm(now)
             return
+        if self.check.entry:
+            self.check.note(now)  # what was to be checked has ended
         first = self._agenda.first()
         if first != self._timer.at:
             self._timer.arm(first)
-        if now - self._rested_at > QUIET_NS and self._watch.at < NEVER:
-            self._watch.arm(NEVER)  # else a parked thread would look, although one waits
+        # a parked thread would look, although one waits
+        if now - self._rested_at > QUIET_NS:
+            if self._watch.at < NEVER:
+                self._watch.arm(NEVER)
+        elif self._watch.at < now + NET_NS - QUIET_NS:
+            self._watch.arm(now + NET_NS)  # the next callback need not set it
         self._rested_at = now
 
     def arm_by(self, at: int) -> None:

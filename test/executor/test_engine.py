@@ -3,7 +3,7 @@
 """The engine by itself, without threads and clocks; its invariants, each broken once."""
 
 import threading
-from time import process_time_ns, sleep
+from time import monotonic_ns, process_time_ns, sleep
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -665,6 +665,21 @@ def test_how_long_a_timer_may_stay_unnoticed(make_executor, kind, deadline, part
         entity.callback, entity.source = None, -1
     entity.habit = GilHabit(kind != 'waits')
     assert pool_of(executor).due.allowance(entity, 10 * MS) == part * MS
+
+
+def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
+    """No parked thread is to wake up in vain while it waits; after a quiet time, none at all."""
+    pool = pool_of(make_executor())
+    due, watch = pool.due, pool.parking.watch
+    begin, found = monotonic_ns(), []
+    with pool.lock:
+        pool.running, pool.polling = True, 1
+        for ms, look in ((100, 104), (101, 103), (102, 120), (110, 112)):
+            watch.arm(begin + look * MS)
+            due.rest(begin + ms * MS)
+            found.append(watch.at if watch.at == NEVER else (watch.at - begin) // MS)
+        pool.running, pool.polling = False, 0
+    assert found == [NEVER, 121, 120, NEVER]
 
 
 class Steps:
