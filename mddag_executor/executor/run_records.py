@@ -59,7 +59,7 @@ class RunRecords:
         """
         Record the run of an undeclared callback, or of one that goes on later.
 
-        :param x: the execution, also if it has just ended; -1: the core does not know it.
+        :param x: the execution, even if it has just ended; -1: the core does not know it.
         """
         self.dispatch(work, x, start, vtid, worker, goes_on)
         self._record('callback_start', start, vtid, work.entity.address, False)
