@@ -34,9 +34,9 @@ Columns: a part of a miss (row of ``Found.parts``), a callback, and how long it 
 Those of a part come one after the other, the longest first.
 """
 _MOST = 5
-"""So many callbacks are named for a part."""
+"""This many callbacks are named for a part."""
 _AT_ONCE = 1 << 22
-"""At most so many times are computed at once, for some parts and all callbacks."""
+"""At most this many times are computed at once, for some parts and all callbacks."""
 
 
 class Members(NamedTuple):

@@ -529,7 +529,7 @@ class Explanation:
         return found
 
     def misses_of(self, verdicts: Table) -> Ints:
-        """Return by verdict its row in ``found.misses``; -1: it is no miss."""
+        """Return by verdict its row in ``found.misses``; -1: it is not a miss."""
         row, _ = equal_pairs(*(
             (each['sink'], each['job']) for each in (self.found.misses, verdicts)))
         return row

@@ -83,7 +83,8 @@ _INIT, _PUBLISH, _RELEASE = (
         'hosted', 'shutdown', 'judge_from', 'messages_lost', 'unfinished',
         'clock_step'))
 _FIELDS = {
-    DISPATCH: 'vtid callback dag vertex job worker ready cpu_time held_interpreter',
+    DISPATCH: 'vtid callback dag vertex job worker ready reference_deadline cpu_time '
+              'held_interpreter',
     END: 'vtid callback',
     COMPLETE: 'vtid callback dag vertex job last_leg completed leg cpu_time held_interpreter',
     _PUBLISH: 'vtid publisher_handle message_timestamp', _RELEASE: 'dag job release',

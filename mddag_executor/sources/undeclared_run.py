@@ -70,6 +70,8 @@ _DROP, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP = (
 _SOON_NS, _SOON_PART = 1_000_000, 10
 # One in this many releases may exclude the origin of the grid, and one has to exclude others.
 _ONE_OF = 20
+# Due times are on the grid if they differ from it by at most this part of the period.
+_A_LITTLE = 100
 
 
 class _OwnLinks(Links):
@@ -276,6 +278,9 @@ class UndeclaredRun(ImportedRun):
             if callback.kind != 'timer' or callback.period <= 0 or len(mine) < 2:
                 continue
             due, first = np.unique(runs['due'][mine], return_index=True)
+            # the executor may have begun to manage the timer after the first one was due
+            since_first = due[1] - due[0] - callback.period // _A_LITTLE
+            due[0] = due[1] - max(1, -(-since_first // callback.period)) * callback.period
             gaps = np.rint(np.diff(due) / callback.period).astype(np.int64) - 1
             mine, due = mine[first[:-1]], due[:-1]
             # it may have been cancelled in the rest of a gap

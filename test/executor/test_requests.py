@@ -179,7 +179,7 @@ def test_requests_of_threads_and_of_other_executors_are_not_urgent(make_executor
 
 
 def test_requests_of_one_service_keep_their_order(make_executor, make_node):
-    """Those before an urgent one are not overtaken by it: they go before what is less urgent."""
+    """Those before an urgent one are not overtaken by it: they go before less urgent work."""
     def ask(each):
         thread = threading.Thread(target=each.request, args=('ask',))
         thread.start()
