@@ -104,7 +104,8 @@ def test_commands_and_options_exist(page):
         assert used - known_options(words) - {'--help'} == set(), line
 
 
-OF_OTHERS = {'--dual-session', '--log-level', '--part', '--show-args', '--use-sim-time', '--version'}
+OF_OTHERS = {
+    '--dual-session', '--log-level', '--part', '--show-args', '--use-sim-time', '--version'}
 
 
 def test_messages_name_options_that_exist():
