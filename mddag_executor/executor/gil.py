@@ -30,11 +30,12 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     for an event, for the GIL, or for a CPU. It waited for an event if it got no CPU for
     ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
     ``SWITCH_INTERVAL_S``; later if the CPUs are busy (``LONG_SLEEP_NS``). It also did if, for a
-    quarter of the time, it was not ready to run and no other thread computed, unless the CPUs are
-    busy with other programs: then the thread that has the GIL may not have computed because it
-    waited for a CPU (``BUSY``). The threads that check compute as well, for as long as the
-    shortest interval. If the thread got no CPU meanwhile, they do not count: it would have got the
-    GIL between two checks, when they gave that away. Anything else is unclear, and counts only
+    quarter of the time, it was not ready to run and no other thread computed. But if it got a CPU
+    in less than ``CHECK_NS``, it may have been woken up for the GIL, late, as virtual CPUs are;
+    and if the CPUs are busy with other programs, the thread that has the GIL may not have computed
+    because it waited for a CPU (``BUSY``). The threads that check compute as well, for as long as
+    the shortest interval. If the thread got no CPU meanwhile, they do not count: it would have got
+    the GIL between two checks, when they gave that away. Anything else is unclear, and counts only
     after ``LATELY`` checks, so that the GIL is not withheld from others for ever.
 """
 
@@ -413,7 +414,9 @@ class GilCheck:
                     new.schedule.slices == last.schedule.slices >= 0):
                 return True
             others = new.others_since(last)
-            if not is_busy and 4 * (passed - others - delayed) >= passed:
+            has_run = new.schedule.slices != last.schedule.slices
+            if not is_busy and (passed >= CHECK_NS or not has_run) and (
+                    4 * (passed - others - delayed) >= passed):
                 return True
         self._unclear += 1
         return self._unclear >= LATELY

