@@ -90,15 +90,25 @@ class _Deferred:
         if number in self._awaited:
             return
         is_second = number in self.pending
-        if _may_interrupt(frame) or is_second and (
-                number == signal.SIGINT or _is_in_callback(frame)):
+        if is_second and number != signal.SIGINT:
+            if self._is_due(number, frame):
+                self.originals[number](number, frame)
+        elif is_second or _may_interrupt(frame):
             if not is_second or self._undefer(number):
                 self.originals[number](number, frame)
-        elif not is_second:
+        else:
             self.pending[number] = True
             if number != signal.SIGINT:
                 # not a ``Thread``: the signal may have interrupted one that starts, with its lock
                 _thread.start_new_thread(self._repeat, (number,))
+
+    def _is_due(self, number: int, frame: FrameType | None) -> bool:
+        """End the deferral of a signal that was sent again, if its handler may be called now."""
+        self._awaited.add(number)  # first: further ones would interrupt this again and again
+        try:
+            return (_may_interrupt(frame) or _is_in_callback(frame)) and self._undefer(number)
+        finally:
+            self._awaited.discard(number)
 
     def _repeat(self, number: int) -> None:
         """Send a signal to the main thread again and again, while its handler is deferred."""

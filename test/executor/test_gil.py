@@ -55,7 +55,7 @@ def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, h
         running.pop()
 
     text = declare(*((
-        name, f'subscription: /{name}, period: 100ms, deadline: 50ms, holds_interpreter: {holds}')
+        name, f'subscription: /{name}, period: 100s, deadline: 50s, holds_interpreter: {holds}')
         for name in 'abcd'))
     nodes = Declared(make_node, text, dict.fromkeys('abcd', body))
     publishers = [make_node('p').create_publisher(Header, f'/{name}', 10) for name in 'abcd']
