@@ -6,7 +6,7 @@ KILTED := .venv-kilted
 # Whole files of tests that run ROS come first, then the others one by one (see test/conftest.py).
 # Three processes keep two cores busy, because those tests wait for a third of their time.
 PYTEST_ARGS ?= -n 3
-TEST_TAKES := 6 minutes on two cores
+TEST_TAKES := 7 minutes on two cores
 BIN := $(VENV)/bin
 
 # The environment brings its own ROS packages. A sourced ROS (or the interpreter of another

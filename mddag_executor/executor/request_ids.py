@@ -12,7 +12,7 @@ against what is shown; if it does not agree, the id is unknown, and the request 
   the id of its writer only; that of the reader follows it in rmw_fastrtps' ``CustomClientInfo``.
   Both must be of one participant.
 
-Other uses: ``pointer`` of a client's handle.  Seen in 7.1 and 9.1.
+Other uses: ``pointer`` of a client's handle.  Seen in 7.1 (Jazzy).
 """
 
 from __future__ import annotations
