@@ -8,11 +8,11 @@ against what is shown; if it does not agree, the id is unknown, and the request 
 
 * The id in a request is in its header (``rmw_service_info_t``), the C++ object behind the head of
   a Python object of pybind11.  Its other fields must be those that rclpy shows.
-* A client of Fast DDS writes the id of the reader for its responses into its requests.  rmw shows
-  the id of its writer only; that of the reader follows it in rmw_fastrtps' ``CustomClientInfo``.
-  Both must be of one participant.
+* A client of Fast DDS writes the id of the reader for its responses into its requests.  In Kilted
+  rmw shows that id.  In Jazzy it shows the id of the writer; that of the reader follows it in
+  rmw_fastrtps' ``CustomClientInfo``.  Both must be of one participant.
 
-Other uses: ``pointer`` of a client's handle.  Seen in 7.1 (Jazzy).
+Other uses: ``pointer`` of a client's handle.  Seen in 7.1 and 9.1.
 """
 
 from __future__ import annotations
@@ -81,12 +81,14 @@ def id_of_client(handle: Any) -> tuple[bytes, str] | None:
     client = _Client.from_address(address)
     if not client.implementation.startswith(b'rmw_fastrtps'):
         return None
-    writer, memory = bytes(gid.data), ctypes.string_at(client.data, _INFO_SIZE)
-    place = memory.find(writer) + _ID_SIZE
-    reader = memory[place:place + _ID_SIZE]
-    if place < _ID_SIZE or len(reader) < _ID_SIZE or reader[-1] != _READER_KIND or (
-            reader[:_PARTICIPANT_SIZE] != writer[:_PARTICIPANT_SIZE]):
-        return None
+    shown = reader = bytes(gid.data)
+    if shown[-1] != _READER_KIND:
+        memory = ctypes.string_at(client.data, _INFO_SIZE)
+        place = memory.find(shown) + _ID_SIZE
+        reader = memory[place:place + _ID_SIZE]
+        if place < _ID_SIZE or len(reader) < _ID_SIZE or reader[-1] != _READER_KIND or (
+                reader[:_PARTICIPANT_SIZE] != shown[:_PARTICIPANT_SIZE]):
+            return None
     return reader, client.service_name.decode()
 
 
