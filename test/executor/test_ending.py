@@ -222,11 +222,17 @@ def test_a_thread_that_cannot_be_started_is_started_by_the_next_spin(
         assert len(pool_of(executor)._threads) == 3
 
 
-def test_too_many_open_files_leave_nothing_behind(ros_context, monkeypatch, tmp_path):
+def test_too_many_open_files_leave_nothing_behind(
+        ros_context, request, monkeypatch, tmp_path):
     """Whichever descriptor the constructor cannot open."""
     MultiDeadlineExecutor(context=ros_context).shutdown()
     unraisable, limits, errors = [], resource.getrlimit(LIMIT), 0
     monkeypatch.setattr(sys, 'unraisablehook', unraisable.append)
+    # no number of a descriptor is free that is less than another one's
+    highest, fillers = max(map(int, os.listdir('/proc/self/fd'))), [os.open(os.devnull, 0)]
+    while fillers[-1] <= highest:
+        fillers.append(os.open(os.devnull, 0))
+    request.addfinalizer(lambda: [os.close(each) for each in fillers])
     before = used()
     for more in range(40):
         resource.setrlimit(LIMIT, (before[1] + more, limits[1]))
