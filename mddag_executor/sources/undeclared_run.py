@@ -275,9 +275,9 @@ class UndeclaredRun(ImportedRun):
         for callback, mine in zip(
                 self.links.callbacks, rows_by(runs['callback'], len(self.links.callbacks))):
             mine = mine[runs['due'][mine] > 0]
-            if callback.kind != 'timer' or callback.period <= 0 or len(mine) < 2:
-                continue
             due, first = np.unique(runs['due'][mine], return_index=True)
+            if callback.kind != 'timer' or callback.period <= 0 or len(due) < 2:
+                continue
             # the executor may have begun to manage the timer after the first one was due
             since_first = due[1] - due[0] - callback.period // _A_LITTLE
             due[0] = due[1] - max(1, -(-since_first // callback.period)) * callback.period

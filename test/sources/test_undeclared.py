@@ -329,6 +329,17 @@ def test_skipped_releases_of_timers_expire_as_in_a_run_with_a_declaration(run):
             for part in each['parts']] == [0]
 
 
+def test_a_timer_that_was_due_once_has_skipped_nothing(run):
+    """Its only execution may be in pieces, as that of a coroutine is."""
+    run.runs(GRAB, 1, 2, 1.5, due=0, ready=0)
+    run.takes(1.509, 1.599)
+    run.runs(GRAB, 50, 51, due=0, ready=0)
+    run.runs(RUN, 52, 53, ready=1.6)
+    result = run.result(100)
+    assert result['dags']['/camera']['jobs'] == 1
+    assert not result['warnings']
+
+
 def test_skipped_releases_of_undeclared_timers_are_counted(run):
     for due, start in ((0, 250), (300, 301), (400, 401)):
         run.runs(SCAN, start, start + 2, start + 1, due=due)
