@@ -171,31 +171,34 @@ class Announcements:
 
     def _announce_silent(self, origin: Origin, topic: str) -> None:
         """Announce that a vertex ends without a topic (rule 6); the engine's lock is held."""
-        others, publisher = self._engine.other_processes, self._publisher
+        others = self._engine.other_processes
         if others is None or not others.is_announced(origin) or topic in self._contested:
             return
         job = self._job(origin)
-        if job is not None and publisher is not None:
+        if job is not None:
             (home, number), release = job
-            entry = _ENTRY.pack(
+            self._send(_ENTRY.pack(
                 self._token, 0, SILENT, 0, 0, home, number, release, origin.dag, origin.vertex,
-                self._number[topic])
-            self._pool.unlocked_calls.append(
-                partial(publish_as_executor, publisher, UInt8MultiArray(data=entry)))
+                self._number[topic]))
 
     def _announce_end(self, dag: int, job: int, end: int) -> None:
         """Announce that a job has ended early (rule 8); the engine's lock is held."""
-        others, publisher = self._engine.other_processes, self._publisher
+        others = self._engine.other_processes
         release = None if others is None else others.ended(dag, job)
-        if release is None or others is None or publisher is None or end not in _EARLY_ENDS:
+        if release is None or others is None or end not in _EARLY_ENDS:
             return
         name = others.name_of(Origin(-1, dag, job, -1)) or (self._token, job)
         if name == self._heard:
             return
-        entry = _ENTRY.pack(
+        self._send(_ENTRY.pack(
             self._token, _EARLY_ENDS.index(end), ENDED, 0, 0, *name,
-            release - self._clock.offset_ns, dag, self._engine.tables.source[dag], 0)
-        self._pool.unlocked_calls.append(partial(publisher.publish, UInt8MultiArray(data=entry)))
+            release - self._clock.offset_ns, dag, self._engine.tables.source[dag], 0))
+
+    def _send(self, entry: bytes) -> None:
+        """Publish an announcement of the executor's own soon, without the engine's lock."""
+        if self._publisher is not None:
+            self._pool.unlocked_calls.append(
+                partial(publish_as_executor, self._publisher, UInt8MultiArray(data=entry)))
 
     def _job(self, origin: Origin) -> tuple[tuple[int, int], int] | None:
         """Return name and release of a job; None: no job, or it has ended meanwhile."""
