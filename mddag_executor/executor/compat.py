@@ -24,6 +24,7 @@ import types
 from typing import Any
 import weakref
 
+from mddag_executor.executor.sent_requests import ACTION, Heritage
 import rclpy
 import rclpy.client
 from rclpy.exceptions import InvalidHandle
@@ -170,8 +171,7 @@ HERITAGE = '_mddag_heritage'
 
 
 def complete_request(
-    client: Any, number: int, response: Any, executor: Any,
-    heritage: tuple[int, int] | None = None,
+    client: Any, number: int, response: Any, executor: Any, heritage: Heritage | None = None
 ) -> None:
     """
     Complete the future of a client's request; its callbacks run in an executor.
@@ -188,9 +188,9 @@ def complete_request(
     future.set_result(response)
 
 
-def heritage_of_response(args: tuple[Any, ...]) -> tuple[int, int] | None:
+def heritage_of_response(args: tuple[Any, ...]) -> Heritage | None:
     """Return what a task inherits that is a done callback of a request's future; None: nothing."""
-    found: tuple[int, int] | None = None
+    found: Heritage | None = None
     if args and isinstance(args[0], Future):
         found = getattr(args[0], HERITAGE, None)
     return found
@@ -317,7 +317,7 @@ def receiver_of(waitable: Any) -> Any:
     client = getattr(waitable, '_client_handle', None)
     if type(client) is CLIENT_HANDLE:
         return client
-    return 'action' if type(getattr(waitable, '_handle', None)) is SERVER_HANDLE else None
+    return ACTION if type(getattr(waitable, '_handle', None)) is SERVER_HANDLE else None
 
 
 def exchanged(waitable: Any, data: Any) -> list[tuple[Any, ...]]:
@@ -327,15 +327,13 @@ def exchanged(waitable: Any, data: Any) -> list[tuple[Any, ...]]:
     They are in the data that the waitable has taken.  A request is given by its kind and goal, a
     response by the client's handle, the kind and the number of the request.
     """
-    if type(data) is not dict:
+    receiver = receiver_of(waitable)
+    if receiver is None or type(data) is not dict:
         return []
     kinds = [kind for kind in ACTION_REQUESTS if kind in data]
-    client = getattr(waitable, '_client_handle', None)
-    if type(client) is CLIENT_HANDLE:
-        return [(client, kind, data[kind][0]) for kind in kinds]
-    if type(getattr(waitable, '_handle', None)) is SERVER_HANDLE:
+    if receiver == ACTION:
         return [(kind, goal_of(data[kind][1])) for kind in kinds]
-    return []
+    return [(receiver, kind, data[kind][0]) for kind in kinds]
 
 
 # --- requests without a middleware (reruns) ------------------------------------------------------

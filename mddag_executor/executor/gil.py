@@ -158,9 +158,10 @@ class GilHabit:
             self._runs = 0  # begin again, without the first ones
         runs = self._runs = min(self._runs + 1, LATELY)
         self.mean_ns += (own - self.mean_ns) // runs
-        # the least is forgotten slowly
-        self._least = undisturbed if runs == 1 else min(
-            undisturbed, self._least + self._least // SELDOM + 1)
+        if runs == 1:
+            self._least = undisturbed
+        else:
+            self._note_duration(undisturbed)
         if counts:
             self.needs_ns = self.mean_ns if self.computes else max(
                 self.mean_ns, self._least)
@@ -192,8 +193,12 @@ class GilHabit:
         :param undisturbed: see ``took``.
         """
         if self._has_waited:
-            self._least = min(undisturbed, self._least + self._least // SELDOM + 1)
+            self._note_duration(undisturbed)
             self.needs_ns = max(self.mean_ns, self._least)
+
+    def _note_duration(self, undisturbed: int) -> None:
+        """Update the least duration, which is forgotten slowly."""
+        self._least = min(undisturbed, self._least + self._least // SELDOM + 1)
 
     def _learn(self, wall: int, own: int, others: int, starved: bool) -> None:
         usual = 0 if self._is_trial else self.holds

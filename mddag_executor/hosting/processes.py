@@ -116,10 +116,15 @@ class Run:
         return f'ended with status {self.status}'
 
     def kill(self) -> None:
-        """End it, and remove the middleware's shared memory that it leaves."""
-        with segments_removed(self.process.pid):
-            self.process.kill()
-            self.process.wait()
+        """End it: see ``kill``."""
+        kill(self.process)
+
+
+def kill(process: subprocess.Popen[Any]) -> None:
+    """End a process, and remove the middleware's shared memory that it leaves."""
+    with segments_removed(process.pid):
+        process.kill()
+        process.wait()
 
 
 class Supervisor:

@@ -22,6 +22,7 @@ from mddag_executor.errors import UsageError
 from mddag_executor.executor import other_processes, path_watch
 from mddag_executor.hosting.processes import (
     combine_results,
+    kill,
     Part,
     ProcessError,
     read_result,
@@ -39,7 +40,6 @@ from mddag_executor.output_rules import (
     remove_recording,
     version_of,
 )
-from mddag_executor.shared_memory import segments_removed
 from mddag_executor.simulate.execution_times import draw_execution_times
 from mddag_executor.synthetic.measure import ExecutionPlan
 from msg_graph import TaskSet
@@ -207,9 +207,7 @@ def _probe(
         except subprocess.TimeoutExpired:
             said = 'it has not made its nodes'
         finally:
-            with segments_removed(process.pid):
-                process.kill()
-                process.wait()
+            kill(process)
     names = read_result(folder, process.pid)
     if names is None:
         lines = [line for line in said.splitlines() if line.strip()]
