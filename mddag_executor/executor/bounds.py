@@ -3,7 +3,7 @@
 """
 Tuning constants of the executor, each with its reason and the measured figure, if any.
 
-Those about the GIL only are in ``gil`` and ``core.queues``.
+Those about the GIL only are in ``gil``, ``gil_check`` and ``core.queues``.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ The longest that a ready callback waits because another one was expected to end.
 
 It is less if the ready one is urgent: its relative deadline by ``PATIENCE_PART``, but not less
 than ``LEAST_PATIENCE_NS``.  A callback that holds the interpreter is checked after half of it, and
-once more after a quarter (``gil.CHECK_PART``).  So an execution with a relative deadline of 20 ms
-starts 0.45 ms and two wake-ups after it became ready, if the callback before it was expected to
-end, but waits: 0.75 ms were measured.
+once more after a quarter (``gil_check.CHECK_PART``).  So an execution with a relative deadline of
+20 ms starts 0.45 ms and two wake-ups after it became ready, if the callback before it was expected
+to end, but waits: 0.75 ms were measured.
 """
 
 PATIENCE_PART = 33
@@ -83,11 +83,12 @@ How long it waits at most for another callback of its program, which is not to o
 If that one waits for the first one (which may own a lock), the two overlap after this time.
 """
 
-REJOIN_NS = 100_000_000
+REJOIN_NS = 50_000_000
 """
-How long a callback waits for its worker after ``Client.call`` before it checks what keeps it.
+How often a callback that waits for its worker after ``Client.call`` checks what keeps it.
 
-If no execution has ended and no running callback has computed meanwhile, it goes on without one.
+If all running callbacks wait for something, and none has ended, since the last check, it goes on
+without one.
 """
 
 END_S = 1.0

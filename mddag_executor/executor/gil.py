@@ -22,42 +22,20 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     is treated so (a trial) after every ``LATELY`` inconclusive ones.
 3.  *A callback that computes with the GIL released* (numpy, hashlib) is measured as if it held it.
     Declare ``holds_interpreter: false`` to run several such callbacks in parallel.
-4.  *A callback that waits though it usually computes* would keep others from the GIL.
-    ``GilCheck`` checks its thread while others wait for the GIL, first after ``CHECK_NS``, or less
-    if what waits is urgent, and then at growing intervals.  If the thread waits, the execution
-    gives the GIL up.
-5.  *Waiting, not starving.* A thread that has not computed since the last check may have waited
-    for an event, for the GIL, or for a CPU. It waited for an event if it got no CPU for
-    ``CHECK_NS`` and is asleep, because a thread that waits for the GIL wakes up every
-    ``SWITCH_INTERVAL_S``; later if the CPUs are busy (``LONG_SLEEP_NS``). It also did if, for a
-    quarter of the time, it was not ready to run and no other thread computed. But if it got a CPU
-    in less than ``CHECK_NS``, it may have been woken up for the GIL, late, as virtual CPUs are;
-    and if the CPUs are busy with other programs, the thread that has the GIL may not have computed
-    because it waited for a CPU (``BUSY``). The threads that check compute as well, for as long as
-    the shortest interval. If the thread got no CPU meanwhile, they do not count: it would have got
-    the GIL between two checks, when they gave that away. Anything else is unclear, and counts only
-    after ``LATELY`` checks, so that the GIL is not withheld from others for ever.
+4.  *A callback that waits though it usually computes* would keep others from the GIL.  So its
+    thread is checked while others wait for the GIL (``gil_check``), first after ``CHECK_NS``, or
+    less if what waits is urgent, and then at growing intervals.  If the thread waits for anything
+    else, the execution gives the GIL up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-import ctypes
-import os
 from resource import getrusage, RUSAGE_THREAD
 import sys
 import threading
-from time import (
-    clock_gettime_ns,
-    monotonic_ns,
-    process_time_ns,
-    pthread_getcpuclockid,
-    thread_time_ns,
-)
-from typing import NamedTuple
-
-from mddag_executor.core import NEVER
+from time import monotonic_ns, process_time_ns, thread_time_ns
 
 COMPUTES = 0.8
 """A callback that computes for this fraction of its time holds the GIL."""
@@ -71,38 +49,10 @@ LATELY = 8
 """
 Averages cover about this many executions.
 
-After as many inconclusive executions in a row, one runs as if it held the GIL; after as many
-unclear checks in a row, about 100 ms, a thread is treated as waiting.
+After as many inconclusive executions in a row, one runs as if it held the GIL.
 """
 SELDOM = 32
 """One in this many short executions is measured (8 us) if the callback's GIL habit is known."""
-
-CHECK_NS = 2_000_000
-LAST_CHECK_NS = 10 * CHECK_NS
-CHECK_PART = 4
-"""
-The interval between checks grows from the first to the last; short callbacks use the last.
-
-The first is shorter if what waits is urgent: this part of ``Interpreter.patience``.  With half of
-it, the successor of a callback that waits after its publication started 0.1 ms later.
-"""
-
-BUSY = 10
-"""
-The CPUs are busy if a thread that is checked was ready for a tenth of the time without one.
-
-That is the time since the first check of its execution: between two checks, a thread that waits
-for the GIL may have been asleep all the time.
-"""
-
-LATE_CHECK_NS = 2 * CHECK_NS
-"""A check that comes later than planned by this much shows that the CPUs are busy."""
-LONG_SLEEP_NS = 5 * CHECK_NS
-"""
-How long a thread that waits for an event is asleep, if the CPUs are busy; else ``CHECK_NS``.
-
-At a load of 20 on two virtual CPUs, threads that waited for the GIL woke up to 2.3 ms late.
-"""
 
 SWITCH_INTERVAL_S = 0.001
 """
@@ -272,159 +222,6 @@ class Measurement:
             self._habit.took(own, wall)
             self._habit.learn(wall, own, process - own, preempted > 0)
         return own
-
-
-class Schedule(NamedTuple):
-    """
-    The kernel's scheduling data of a thread.
-
-    :ivar delay_ns: how long it was ready to run without a CPU; 0 if unknown.
-    :ivar slices: how often it got a CPU; -1 if unknown.
-    """
-
-    delay_ns: int
-    slices: int
-
-
-_libc = ctypes.PyDLL(None)  # none of the calls below blocks, so the GIL is kept
-_libc.read.restype = ctypes.c_ssize_t
-
-
-def _read(path: str) -> bytes:
-    """Return the beginning of a file of procfs; empty if there is no such file."""
-    file = _libc.open(path.encode(), os.O_RDONLY | os.O_CLOEXEC)
-    if file < 0:
-        return b''
-    buffer = ctypes.create_string_buffer(256)
-    size = _libc.read(file, buffer, len(buffer))
-    _libc.close(file)
-    return buffer.raw[:max(0, size)]
-
-
-def schedule_of(tid: int) -> Schedule:
-    """Return the scheduling data of a thread of this process, by its native id."""
-    figures = _read(f'/proc/self/task/{tid}/schedstat').split()
-    if len(figures) != 3:
-        return Schedule(0, -1)
-    return Schedule(int(figures[1]), int(figures[2]))
-
-
-def is_asleep(tid: int) -> bool:
-    """Return whether a thread of this process neither runs nor is ready to run."""
-    # the kernel needs longer to write this file than the one of ``schedule_of``
-    return _read(f'/proc/self/task/{tid}/stat').rpartition(b') ')[2][:1] in b'SD'
-
-
-def cpu_ns(ident: int) -> int:
-    """Return the CPU time of a thread, ns."""
-    return clock_gettime_ns(pthread_getcpuclockid(ident))
-
-
-class _Reading(NamedTuple):
-    at: int
-    own: int
-    process: int
-    schedule: Schedule
-    resting: Mapping[Hashable, int]
-
-    def others_since(self, last: _Reading) -> int:
-        """Return for how long other threads, but those that check, have computed, ns."""
-        others = (self.process - self.own) - (last.process - last.own)
-        if self.schedule.slices == last.schedule.slices >= 0:
-            others -= sum(
-                used - last.resting[key] for key, used in self.resting.items()
-                if key in last.resting)
-        return max(0, others)
-
-
-_NONE: Mapping[Hashable, int] = {}
-
-
-class GilCheck:
-    """
-    Finds out whether an execution that holds the GIL computes.
-
-    :ivar at: when to check next, monotonic ns; NEVER: never.
-    :ivar subject: the execution to check.
-    """
-
-    __slots__ = ('at', 'subject', '_step', '_first', '_last', '_unclear', '_observed', '_delayed')
-
-    def __init__(self) -> None:
-        self.at = NEVER
-        self.subject: object = None
-        self._step = self._first = 0
-        # for how long it has been observed, and was ready to run without a CPU meanwhile
-        self._observed = self._delayed = 0
-        self._last: _Reading | None = None
-        self._unclear = 0
-
-    def begin(self, subject: object, now: int, after: int, step: int) -> None:
-        """
-        Start checking an execution, unless it is being checked already as soon.
-
-        :param after: time until the first check, ns; ``step``: from that to the second one.
-        """
-        if self.subject is not subject:
-            self._observed = self._delayed = 0
-        if self.subject is not subject or after < self._step:
-            self._first = step
-            self.subject = subject
-            self._step = after
-            self._last = None
-            self._unclear = 0
-            self.at = now + after
-            if after >= LAST_CHECK_NS:
-                # on a grid, so that several short callbacks do not each set the timer again
-                self.at = self.at // CHECK_NS * CHECK_NS + CHECK_NS
-
-    def has_begun(self, subject: object) -> bool:
-        """Return whether there is a first reading of an execution."""
-        return self.subject is subject and self._last is not None
-
-    def end(self) -> None:
-        """Stop checking."""
-        self.subject = None
-        self.at = NEVER
-
-    def waits(
-        self, ident: int, tid: int, now: int, resting: Mapping[Hashable, int] = _NONE
-    ) -> bool:
-        """
-        Return whether the thread has waited for anything but the GIL since the last check.
-
-        :param ident: the thread's id in Python; ``tid``: its native id.
-        :param now: monotonic ns.
-        :param resting: the CPU times of the threads that only check and wait, ns; the key of each
-            changes when it has run anything else.
-        """
-        last, late = self._last, now - self.at
-        new = self._last = _Reading(
-            now, cpu_ns(ident), process_time_ns(), schedule_of(tid), resting)
-        self._step = self._first if last is None else min(2 * self._step, LAST_CHECK_NS)
-        self.at = now + self._step
-        if last is None:
-            return False
-        passed, own = now - last.at, new.own - last.own
-        delayed = new.schedule.delay_ns - last.schedule.delay_ns
-        self._observed += passed
-        is_late = late >= LATE_CHECK_NS
-        self._delayed += delayed + late * is_late
-        if 20 * own >= passed:  # it computes for at least 5 % of the time
-            self._unclear = 0
-            return False
-        if is_asleep(tid):
-            is_busy = BUSY * self._delayed >= self._observed
-            if passed >= (LONG_SLEEP_NS if is_busy else CHECK_NS) and not is_late and (
-                    new.schedule.slices == last.schedule.slices >= 0):
-                return True
-            others = new.others_since(last)
-            has_run = new.schedule.slices != last.schedule.slices
-            if not is_busy and (passed >= CHECK_NS or not has_run) and (
-                    4 * (passed - others - delayed) >= passed):
-                return True
-        self._unclear += 1
-        return self._unclear >= LATELY
 
 
 def times_preempted() -> int:

@@ -3,20 +3,20 @@
 """
 Whether the execution that holds the interpreter computes, while something waits for it.
 
-If it waits for anything else, it gives the interpreter up (``gil``, 4 and 5).  A paused thread
+If it waits for anything else, it gives the interpreter up (``gil``, 4).  A paused thread
 checks this itself (``pausing``), so no other thread does meanwhile.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from mddag_executor.core import NEVER
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
 from mddag_executor.executor.engine import Engine
-from mddag_executor.executor.gil import CHECK_NS, CHECK_PART, GilCheck, LAST_CHECK_NS
+from mddag_executor.executor.gil_check import CHECK_NS, CHECK_PART, GilCheck, LAST_CHECK_NS
 from mddag_executor.executor.pausing import Pauses
 from mddag_executor.executor.work import Work
 
@@ -38,9 +38,6 @@ class Threads(Protocol):
 
     def thread_of(self, work: Work) -> Thread | None:
         """Return the thread that runs an execution."""
-
-    def cpu_of_resting(self) -> dict[Hashable, int]:
-        """Return the CPU times (ns) of the threads that run no callback: see ``GilCheck``."""
 
 
 class HolderCheck:
@@ -138,8 +135,7 @@ class HolderCheck:
             self._check.end()
         elif holder is not self._check.subject:  # one of several short callbacks in a row
             self._watch(now)
-        elif self._check.waits(
-                thread.ident, thread.vtid, now, self._pool.cpu_of_resting()):
+        elif self._check.waits(thread.ident, thread.vtid, now):
             self._check.end()
             self._pool.engine.stop_holding(holder)
             self._pool.pauses.end()

@@ -10,20 +10,22 @@ left than there are workers, a thread is made.  At most ``MOST`` callbacks lend 
 further ones keep their workers.  When it has its answer, it *rejoins*: it waits in the core like
 any other execution, and its thread waits for its permit.  The thread that dispatches it hands its
 worker over, and chooses again.  All workers may run callbacks that wait for this one (it may own a
-lock).  So if in ``REJOIN_NS`` no execution has ended, and the running callbacks have computed
-nothing, it goes on without a worker; as it does when a spin ends, or in ``spin_once``, where only
-one callback runs.  Other threads of the program may compute meanwhile: they need no worker.
+lock).  So it goes on without a worker if all running callbacks wait for something (``GilCheck``),
+and none has ended, at two checks in a row; as it does when a spin ends, or in ``spin_once``, where
+only one callback runs.  Other threads of the program may compute meanwhile: they need no worker.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from time import monotonic_ns
 from typing import Any, Protocol
 
 from mddag_executor.executor.bounds import ALONE_NS, MOST, REJOIN_NS
 from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.engine import Engine, Step
+from mddag_executor.executor.gil_check import GilCheck
 from mddag_executor.executor.hall import Spinner
 from mddag_executor.executor.pausing import Pauses
 from mddag_executor.executor.threads import ThreadState, WorkerThread
@@ -53,8 +55,8 @@ class Pool(Protocol):
     def tick(self) -> int:
         """Return the engine's time now."""
 
-    def cpu_of_running(self) -> int:
-        """Return the CPU time (ns) of the threads whose callbacks run with a worker."""
+    def running_threads(self) -> list[WorkerThread]:
+        """Return the threads whose callbacks run with a worker."""
 
     def become(self, me: WorkerThread, state: ThreadState) -> None:
         """Change the state of a thread."""
@@ -148,17 +150,24 @@ class Lending:
                 pool.wake_for(step, now)
             else:
                 pool.call()
-            seen = pool.n_ended, pool.cpu_of_running()
+        checks: dict[WorkerThread, GilCheck] = {}
+        seen = -1, False
         while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
             with pool.lock:
-                before, seen = seen, (pool.n_ended, pool.cpu_of_running())
+                before, seen = seen, (pool.n_ended, self._all_wait(checks))
                 if work in self.rejoining and engine.waits_for_place(work) and (
                         pool.now - now < ALONE_NS):
                     pool.tick()     # it is not to overlap with the one that has its place
-                elif (work in self.rejoining and before[0] == seen[0]
-                        and seen[1] - before[1] < REJOIN_NS // 10):
+                elif work in self.rejoining and seen == (before[0], True):
                     self._go_on_without(work)
         me.wait_for_pause()
+
+    def _all_wait(self, checks: dict[WorkerThread, GilCheck]) -> bool:
+        """Return whether all running callbacks have waited since the last call."""
+        now = monotonic_ns()
+        answers = [checks.setdefault(each, GilCheck()).waits(each.ident, each.vtid, now)
+                   for each in self._pool.running_threads()]
+        return all(answers)
 
     def hand_over(self, step: Step) -> None:
         """Let an execution go on that was dispatched again; the caller holds the lock."""

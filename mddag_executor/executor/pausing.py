@@ -34,7 +34,7 @@ from types import CodeType, FrameType
 from typing import Any, Protocol
 
 import mddag_executor
-from mddag_executor.executor.gil import GilCheck
+from mddag_executor.executor.gil_check import GilCheck
 import rclpy
 
 PAUSES_BY_S = 0.001

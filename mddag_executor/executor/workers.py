@@ -35,7 +35,7 @@ Theory of operation
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 import threading
@@ -57,7 +57,6 @@ from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.engine import Engine, Step
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import cpu_ns
 from mddag_executor.executor.hall import Announced, Spinner
 from mddag_executor.executor.lending import Lending
 from mddag_executor.executor.loop import EventLoop, Events, Parking
@@ -717,15 +716,10 @@ class WorkerPool:
         return next(
             (each for each in self.threads() if each.work is work), None)
 
-    def cpu_of_resting(self) -> dict[Hashable, int]:
-        """Return the CPU times (ns) of the threads that run no callback: see ``GilCheck``."""
-        return {(each.ident, each.end): cpu_ns(each.ident)
-                for each in self._threads if each.work is None and each.ident}
-
-    def cpu_of_running(self) -> int:
-        """Return the CPU time (ns) of the threads whose callbacks run with a worker."""
-        return sum(cpu_ns(each.ident) for each in self._threads
-                   if each.state is ThreadState.RUNNING and each.work is not None)
+    def running_threads(self) -> list[WorkerThread]:
+        """Return the threads whose callbacks run with a worker."""
+        return [each for each in self._threads
+                if each.state is ThreadState.RUNNING and each.work is not None]
 
     # --- executions ------------------------------------------------------------------------------
 

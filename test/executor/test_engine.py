@@ -3,7 +3,7 @@
 """The engine by itself, without threads and clocks; its invariants, each broken once."""
 
 import threading
-from time import monotonic_ns, process_time_ns, sleep
+from time import monotonic_ns
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -12,19 +12,12 @@ from mddag_executor.core.jobs import source_depth
 from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
-from mddag_executor.executor import gil
 from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.gil import (
-    CHECK_PART,
-    cpu_ns,
-    GilCheck,
-    GilHabit,
-    is_asleep,
-    Schedule,
-)
+from mddag_executor.executor.gil import GilHabit
+from mddag_executor.executor.gil_check import CHECK_PART, GilCheck
 from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest
@@ -593,50 +586,6 @@ def test_what_is_taken_while_its_node_is_removed_counts_as_dropped():
     engine.finish(2)
     engine.ready(Work(entity, print), 3)  # its recording is closed
     assert entity.dropped == len(recorded) == 1
-
-
-def test_the_threads_that_check_do_not_count_as_computing():
-    """
-    They compute for as long as the shortest interval between two checks.
-
-    A thread that got no CPU meanwhile did not wait for the GIL, which they gave away.
-    """
-    ended = threading.Lock()
-    ended.acquire()
-    sleeper = threading.Thread(target=ended.acquire, daemon=True)
-    sleeper.start()
-    tid, me = sleeper.native_id, threading.get_ident()
-    while not is_asleep(tid):
-        sleep(0.001)
-    found = []
-    for before, after in ((0, 0), (0, 1)):  # the second time, the thread has run a callback
-        check = GilCheck()
-        check.begin(sleeper, 0, 0, MS)
-        began = process_time_ns()
-        check.waits(sleeper.ident, tid, 0, {(me, before): cpu_ns(me)})
-        while process_time_ns() < began + MS:
-            pass
-        used = min(process_time_ns() - began, 2 * MS - 1)
-        found.append(check.waits(sleeper.ident, tid, used, {(me, after): cpu_ns(me)}))
-    ended.release()
-    sleeper.join()
-    assert found == [True, False]
-
-
-@pytest.mark.parametrize(('delay', 'waits'), [(0, True), (1, True), (2, False), (12, False)])
-def test_on_a_busy_machine_a_thread_that_waits_for_the_gil_does_not_count_as_waiting(
-    monkeypatch, delay, waits
-):
-    """The thread that has the GIL waits for a CPU, so no thread computes."""
-    schedules = iter((Schedule(0, 10), Schedule(delay * MS, 12)))
-    monkeypatch.setattr(gil, 'schedule_of', lambda tid: next(schedules))
-    monkeypatch.setattr(gil, 'is_asleep', lambda tid: True)
-    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: 0)
-    monkeypatch.setattr(gil, 'process_time_ns', lambda: 0)
-    check = GilCheck()
-    check.begin(check, 0, 0, 20 * MS)
-    assert not check.waits(0, 0, 0)
-    assert check.waits(0, 0, 20 * MS) == waits
 
 
 def test_the_time_of_pauses_does_not_count_as_held():

@@ -25,7 +25,7 @@ from rclpy.timer import Rate
 from std_msgs.msg import Header, Int32
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, matched, patience, Pulse, Spinning, wait_for
+from .conftest import matched, patience, Pulse, Spinning, wait_for
 from .inside import functions_of_tasks, pool_of
 
 MS = 1_000_000
@@ -232,29 +232,6 @@ def test_one_slow_execution_does_not_make_a_callback_long(make_executor, monkeyp
         takes[0] = 10 * MS
         execute()
     assert entity.wall_ns > SHORT_CALLBACK_NS
-
-
-def test_the_threads_that_only_check_are_those_that_run_no_callback(make_executor, make_node):
-    """Their CPU times are known by the last end of a callback in each of them."""
-    node, seen = make_node(), []
-    executor = make_executor(num_workers=3, nodes=[node])
-    pool = pool_of(executor)
-
-    def look():
-        with pool.lock:
-            seen.append((threading.get_ident(), pool.cpu_of_resting()))
-        timer.cancel()
-
-    timer = node.create_timer(0.001, look)
-    with Spinning(executor):
-        assert wait_for(lambda: seen and is_idle(executor))
-        with pool.lock:
-            after = pool.cpu_of_resting()
-    me, resting = seen[0]
-    assert me not in {ident for ident, _ in resting}
-    assert {ident for ident, _ in after} >= {me, *(ident for ident, _ in resting)}
-    assert all(after[key] >= used for key, used in resting.items() if key in after)
-    assert all(end > 0 for ident, end in after if ident == me)
 
 
 def test_a_response_makes_no_task(make_executor, make_node):

@@ -10,7 +10,7 @@ import threading
 import time
 from types import SimpleNamespace
 
-from mddag_executor.executor import gil, pausing, publishing
+from mddag_executor.executor import pausing, publishing
 from mddag_executor.executor.compat import function_of_task
 from mddag_executor.executor.pausing import can_pause
 from mddag_executor.executor.work import current
@@ -67,33 +67,6 @@ def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, h
         assert wait_for(lambda: len(at_once) == 4 and not running, 20.0)
     assert max(at_once) == most
     assert [*intervals] == [pytest.approx(0.001)] and sys.getswitchinterval() == before
-
-
-@pytest.mark.parametrize('delay_ms, waits', [(0, True), (8, False)], ids=['idle', 'busy'])
-def test_a_thread_that_sleeps_waits_unless_the_cpus_are_busy(monkeypatch, delay_ms, waits):
-    """On a busy machine it may be the thread that has the GIL that gets no CPU."""
-    own, schedules = iter([0, MS, MS]), iter([
-        gil.Schedule(0, 10), gil.Schedule(delay_ms * MS, 14), gil.Schedule(delay_ms * MS, 14)])
-    used = iter([0, MS, MS])
-    monkeypatch.setattr(gil, 'is_asleep', lambda tid: True)
-    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: next(own))
-    monkeypatch.setattr(gil, 'process_time_ns', lambda: next(used))
-    monkeypatch.setattr(gil, 'schedule_of', lambda tid: next(schedules))
-    check = gil.GilCheck()
-    check.begin('execution', 0, 2 * MS, 10 * MS)
-    assert [check.waits(1, 1, at) for at in (2 * MS, 12 * MS, 15 * MS)] == [False, False, waits]
-
-
-@pytest.mark.parametrize('late_ms, waits', [(0, True), (6, False)])
-def test_a_thread_that_sleeps_waits_unless_the_check_is_late(monkeypatch, late_ms, waits):
-    """The machine may have stopped meanwhile."""
-    monkeypatch.setattr(gil, 'cpu_ns', lambda ident: 0)
-    monkeypatch.setattr(gil, 'process_time_ns', lambda: 0)
-    monkeypatch.setattr(gil, 'schedule_of', lambda tid: gil.Schedule(0, 10))
-    monkeypatch.setattr(gil, 'is_asleep', lambda tid: True)
-    check = gil.GilCheck()
-    check.begin('execution', 0, 2 * MS, 3 * MS)
-    assert [check.waits(1, 1, at) for at in (2 * MS, (5 + late_ms) * MS)] == [False, waits]
 
 
 def test_what_is_learnt_of_callbacks(make_executor, make_node):
@@ -206,16 +179,13 @@ def computing(request, make_executor, make_node, monkeypatch):
         yield found
 
 
-def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing, monkeypatch):
+def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing):
     """
     The long one does not wait for an urgent one, however long it usually takes.
 
     A patient one never begins before the long one has ended. As no thread is woken for it, it may
     only be taken then; so it must not be overlooked.
     """
-    # on a machine whose CPUs are busy with other programs, the thread that checks gets none for
-    # long while it has the GIL, and a thread that waits for the GIL meanwhile seems to wait
-    monkeypatch.setattr(gil.GilCheck, 'waits', lambda *_: False)
     for _ in range(3):
         assert computing.order('patient') == ['begins', 'ends', 'patient']
     computing.meanwhile = lambda: 'urgent' in computing.ran
@@ -509,11 +479,8 @@ def test_a_callback_pauses_for_a_more_urgent_one_that_goes_on(make_executor, mak
 
 
 @pytest.mark.parametrize('is_async', [False, True])
-def test_a_task_holds_the_gil_if_its_function_does(
-        make_executor, make_node, monkeypatch, is_async):
+def test_a_task_holds_the_gil_if_its_function_does(make_executor, make_node, is_async):
     """That is learnt of each function: tasks that wait do not change it."""
-    # a virtual CPU may wake up so late that a thread seems to wait: one check in thousands errs
-    monkeypatch.setattr('mddag_executor.executor.gil.GilCheck.waits', lambda *_: False)
     lending, is_long = Lending(make_executor, make_node, 7, patient='120s'), threading.Event()
     executor = lending.executor
 

@@ -211,6 +211,11 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('paused_callbacks_wait_for_ever', [(
         'executor/pausing.py', 'pauses.overtaker_waits(work)', 'pass')], of(
         'test_gil.py', 'test_a_callback_that_owns_a_lock_does_not_pause_for_ever[here-user]')),
+    Case('threads_that_wait_for_the_gil_count_as_waiting', [(
+        'executor/gil_check.py', 'abs(address - _gil_address()) >= GIL_BYTES', 'True')], of(
+        'test_gil_check.py',
+        'test_a_thread_that_waits_for_the_gil_is_never_taken_for_one_that_waits[0]',
+        'test_a_callback_that_computes_keeps_the_gil[0]'), every=True),
     Case('nobody_looks', [(
         'executor/workers.py', """\
 self.due.has_looked(now - self.offset)
