@@ -26,7 +26,7 @@ along its critical chain (see ``chains``):
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
 * end of a callback until the next one is ready: *transport*; *other topic* if the next one is a
   driven sync that completed with a message of another topic than the driving one;
-* ready callback in a recording of another executor, which does not say when a message or timer was
+* ready callback in a process of another executor, which does not say when a message or timer was
   noticed: *waited* while its own thread ran a callback; with an idle thread *released late* (a
   source), else *transport*, because the message was still on its way;
 * job that ended early because of a callback that never ran, or a sync that did not get all of its
@@ -145,14 +145,14 @@ class Pool(NamedTuple):
     """
     What ran and what stalled during the misses.
 
-    :ivar busy: by place what ran there; in a recording of another executor of all places together.
+    :ivar busy: by place what ran there, if it is a process.
     :ivar stalls: begin and end of each stall.
     :ivar knows_workers: whether the number of workers is known, and an idle one starts what is
         ready.
     :ivar place_of: by execution its place, whose callbacks may delay each other: its thread in a
         recording of another executor, else its process; ``place_of_vertex``: the same of the last
         execution of each vertex, -1: none.
-    :ivar threads: by thread when callbacks ran in it; None: places are processes.
+    :ivar threads: by thread when callbacks ran in it; None: all places are processes.
     :ivar hangs: by execution whether it never ended, and had run for ``HANGS_NS``.
     :ivar blocked: by vertex when such an execution kept its callback group busy.
     :ivar programs: by vertex when callbacks of its program ran, if that runs one at a time.
@@ -179,8 +179,7 @@ class Pool(NamedTuple):
         """
         covered = np.zeros(len(spans), dtype=np.int64)
         for place, busy in self.busy.items():
-            mine = np.flatnonzero(
-                spans['place'] == place) if self.threads is None else np.arange(len(spans))
+            mine = np.flatnonzero(spans['place'] == place)
             covered[mine] = getattr(busy, kind).within(spans['begin'][mine], spans['end'][mine])
         return covered
 
@@ -421,16 +420,32 @@ def _waits(spans: Table, left: Ints, pool: Pool, is_source: Any) -> Ints:
     # the group is busy only while the program is
     times[:, PROGRAM] = np.clip(occupied - np.minimum(spans['more'], occupied), 0, left)
     left = left - times[:, PROGRAM]
-    if pool.threads is not None:
-        for thread in distinct(spans['place']).tolist():
-            mine = np.flatnonzero(spans['place'] == thread)
-            # without an execution its thread is unknown
-            times[mine, WAITED] = left[mine] if thread not in pool.threads else np.minimum(
-                left[mine], pool.threads[thread].within(spans['begin'][mine], spans['end'][mine]))
-        idle, source = left - times[:, WAITED], is_source[spans['vertex']]
-        times[:, RELEASED_LATE] = np.where(source, idle, 0)
-        times[:, TRANSPORT] = np.where(source, 0, idle)
-        return times
+    in_thread = np.zeros(len(spans), dtype=np.bool_) if pool.threads is None else ~np.isin(
+        spans['place'], [*pool.busy])
+    mine, others = np.flatnonzero(~in_thread), np.flatnonzero(in_thread)
+    times[mine] = _waits_in_process(spans[mine], left[mine], times[mine], pool)
+    times[others] = _waits_in_thread(spans[others], left[others], times[others], pool, is_source)
+    return times
+
+
+def _waits_in_thread(
+    spans: Table, left: Ints, times: Ints, pool: Pool, is_source: Any
+) -> Ints:
+    """Split the rest of the waiting time in threads, which nothing else may delay."""
+    threads = pool.threads or {}
+    for thread in distinct(spans['place']).tolist():
+        mine = np.flatnonzero(spans['place'] == thread)
+        # without an execution its thread is unknown
+        times[mine, WAITED] = left[mine] if thread not in threads else np.minimum(
+            left[mine], threads[thread].within(spans['begin'][mine], spans['end'][mine]))
+    idle, source = left - times[:, WAITED], is_source[spans['vertex']]
+    times[:, RELEASED_LATE] = np.where(source, idle, 0)
+    times[:, TRANSPORT] = np.where(source, 0, idle)
+    return times
+
+
+def _waits_in_process(spans: Table, left: Ints, times: Ints, pool: Pool) -> Ints:
+    """Split the rest of the waiting time in processes, by what their workers did."""
     if not pool.knows_workers:
         times[:, WAITED] = left
         return times

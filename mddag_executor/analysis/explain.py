@@ -68,6 +68,8 @@ if TYPE_CHECKING:
     )
 
 _NO_END = 2 ** 62
+_FIRST_PROCESS = -2
+"""In a run that other executors share, the place of the first process; threads have 0 and up."""
 _STEPS = 32     # per octave
 _ROUGHLY_NS = 1_000_000
 """A demotion this shortly before the latest start may be because of lateness."""
@@ -84,12 +86,17 @@ class Explanation:
         self._rows = ran(self._executions)
         run = recording.run
         # of each process
-        self._workers = 0 if run.imported or run.head.policy in SIMULATED_ONLY else (
-            run.head.workers if run.processes == 1 else run.workers_each)
+        if run.imported:
+            self._workers = max(run.own_processes.values(), default=0)
+        else:
+            self._workers = 0 if run.head.policy in SIMULATED_ONLY else (
+                run.head.workers if run.processes == 1 else run.workers_each)
         # where callbacks may delay each other: of another executor it is not known which threads
         # share its work
-        self._place = self._executions['worker' if run.imported else 'process'].astype(
-            np.int64)
+        self._place = self._executions['process'].astype(np.int64)
+        own = recording.own_executions[:len(self._place)]
+        if run.imported:
+            self._place = np.where(own, _FIRST_PROCESS - self._place, self._executions['worker'])
         #: Begin and end of each stop of the machine.
         self.stops = self._stops()
         missed, links = self._missed(judged, chains)
@@ -145,16 +152,16 @@ class Explanation:
         one = not imported and self._recording.run.processes == 1
         of_vertex = np.full(len(self._task_set.vertices) + 1, 0 if one else -1)
         of_vertex[table['vertex'][rows]] = self._place[rows]
+        places = {*([0] if one else ()), *distinct(self._place[rows]).tolist()}
+        of_threads = {place for place in places if imported and place > _FIRST_PROCESS}
         threads = {
             thread: Spans(*crowded(table['start'][each], table['end'][each], 1))
-            for thread in distinct(self._place[rows]).tolist()
-            for each in [rows[self._place[rows] == thread]]
+            for thread in of_threads for each in [rows[self._place[rows] == thread]]
         } if imported else None
         hangs, blocked = self._hangs()
         return Pool(
-            {-1: self._busy(rows, hangs)} if imported else {
-                place: self._busy(rows[self._place[rows] == place], hangs)
-                for place in {*([0] if one else ()), *distinct(self._place[rows]).tolist()}},
+            {place: self._busy(rows[self._place[rows] == place], hangs)
+             for place in places - of_threads},
             [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
             self._place, of_vertex, threads, hangs, blocked, self._busy_programs(),
             self._answers())

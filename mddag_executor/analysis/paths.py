@@ -289,8 +289,9 @@ class Paths:
         rows: Any = self._of_place[self._places[callback.key]]
         table = self._table[['start', 'end', 'callback', 'job', 'worker']][rows]
         started = table['start'] >= 0
-        if not self._recording.run.imported:    # those that waited at the end have no worker
-            started &= (table['end'] >= 0) | (table['worker'] >= 0)
+        # those of this executor that waited at the end have no worker
+        started &= (table['end'] >= 0) | (table['worker'] >= 0) | (
+            ~self._recording.own_executions[rows])
         ended = np.flatnonzero(started & (table['end'] >= 0))
         ended = ended[sort_by(table['end'][ended])]
         mine = np.flatnonzero(started & (self._first(rows) == rows))

@@ -11,7 +11,7 @@ from typing import Any
 
 from mddag_executor.core import NEVER
 from mddag_executor.recording import cut, frames
-from mddag_executor.recording.columns import Ints, Places, Table
+from mddag_executor.recording.columns import Ints, Mask, Places, Table
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.joins import different
 from mddag_executor.recording.losses import Losses
@@ -157,6 +157,7 @@ class Recording:
             return None
         ends, released = self.job_ends, self.releases['release']
         begin, end = self.run.judged_releases or (-NEVER, NEVER)
+        begin = max(begin, self.run.judge_from)
         judged = self.jobs.marked((released >= begin) & (released < end))[self.jobs.places(ends)]
         dags, counts = np.unique(
             ends['dag'][judged & (ends['reason'] == WITHDRAWN)], return_counts=True)
@@ -171,6 +172,14 @@ class Recording:
     def job_places(self) -> Places:
         """Return by execution the place of its job in ``jobs``; -1: none."""
         return self.jobs.places(self.executions)
+
+    @cached_property
+    def own_executions(self) -> Mask:
+        """Return by execution whether this executor ran it."""
+        process, of = self.executions['process'], self.run.own_processes
+        own: Mask = np.isin(process, [*of]) if self.run.imported else np.ones(
+            len(process), dtype=np.bool_)
+        return own
 
     def runs_of_programs(self) -> dict[int, Table]:
         """

@@ -23,7 +23,9 @@ class Run:
     :ivar task_set: numbers DAGs and vertices.
     :ivar recorded_set: the recorded DAG tasks.
     :ivar declared: whether the recording contains a declaration.
-    :ivar imported: whether another executor ran it.
+    :ivar imported: whether another executor ran it, or some of its processes.
+    :ivar own_processes: of an imported run the processes that this executor ran, each with its
+        number of workers.
     :ivar same: whether the run itself was judged by ``task_set``.
     :ivar start: the first release, or when the first execution became ready, ns; None: neither.
     :ivar end: the end of the run, ns; ``shut_down``: whether it is recorded.
@@ -50,6 +52,7 @@ class Run:
     recorded_set: TaskSet
     declared: bool = True
     imported: bool = False
+    own_processes: Mapping[int, int] = field(default_factory=dict)
     same: bool = True
     start: int | None = None
     end: int = 0

@@ -126,12 +126,6 @@ class ImportedClocks:
             known[sends] & known[receives])
         return found
 
-    @property
-    def shifts(self) -> Ints:
-        """Return by thread of the recording what is added to its times, ns."""
-        return np.array([self.shift.get(pid, 0) for pid, _ in self._links.threads],
-                        dtype=np.int64)
-
     def lines(self) -> Iterator[str]:
         """Yield what is assumed about the clocks, and what is not judged."""
         for one, other in {(min(way), max(way)): None for way in self._assumed}:

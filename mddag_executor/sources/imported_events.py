@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable as Function
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from mddag_executor.recording.columns import Ints, rows, Table
 from mddag_executor.recording.joins import different, sort_by
@@ -68,8 +68,10 @@ The same for a trace of this executor without declaration.
 takes apart.
 """
 
-_INIT_TIME = 'init_timestamp'
-"""The field of a timer's initialisation that is a time."""
+_TIMES = ('init_timestamp', 'ready', 'start')
+"""The fields of other events that are times: of a timer's initialisation, of `unfinished`."""
+_COLUMNS_OF_TIMES = {START: ('b', 'c'), SHUTDOWN: ('a',)}
+"""By kind of event its columns that are times, 0: unknown; LTTng's starts have none."""
 _EVENT = np.dtype([('time', 'i8'), ('place', 'i8'), ('thread', 'i8'), ('kind', 'i1'),
                    ('a', 'i8'), ('b', 'i8'), ('c', 'i8'), ('d', 'i8')])
 
@@ -83,6 +85,8 @@ class Events(NamedTuple):
     :ivar others: the other events, as tuples with a ``Layout``, in the order of time.
     :ivar warning: events at impossible times, which were left out; empty: none.
     :ivar names: the last name of a thread, by process and thread id.
+    :ivar own: the processes that this executor ran.
+    :ivar shift: by process what was added to the recorded times, ns.
     """
 
     table: Table
@@ -90,6 +94,12 @@ class Events(NamedTuple):
     others: list[Event]
     warning: str
     names: Mapping[tuple[int, int], str] = {}
+    own: frozenset[int] = frozenset()
+    shift: Mapping[int, int] = {}
+
+    def of_threads(self, by_process: Mapping[int, int]) -> Ints:
+        """Return the values of the processes of all threads; 0: none."""
+        return np.array([by_process.get(pid, 0) for pid, _ in self.threads], dtype=np.int64)
 
 
 def computed(packed: Ints) -> tuple[Ints, Ints]:
@@ -104,8 +114,12 @@ def moved(events: Events, shift: Mapping[int, int]) -> Events:
     :param shift: by process id what is added, ns.  Source timestamps in events do not change.
     """
     table = events.table.copy()
-    table['time'] += np.array(
-        [shift.get(pid, 0) for pid, _ in events.threads], dtype=np.int64)[table['thread']]
+    more = events.of_threads(shift)[table['thread']]
+    table['time'] += more
+    for kind, columns in _COLUMNS_OF_TIMES.items() if events.own else ():
+        for column in columns:
+            mine = np.flatnonzero((table['kind'] == kind) & (table[column] > 0))
+            table[column][mine] += more[mine]
     # it is not known which clock a gap has: it is in its place by each of them
     lost, later = table['kind'] == LOST, max(0, *shift.values())
     table['b'][lost & (table['b'] == 0)] = events.table['time'][lost & (table['b'] == 0)]
@@ -114,34 +128,60 @@ def moved(events: Events, shift: Mapping[int, int]) -> Events:
     table['time'] = np.clip(table['time'], 0, NEVER - 1)
     others = []
     for layout, time, pid, *rest in events.others:
-        more = shift.get(pid, 0)
-        if _INIT_TIME in layout.fields:
-            rest[1 + layout.fields.index(_INIT_TIME)] += more
-        others.append((layout, min(max(0, time + more), NEVER - 1), pid, *rest))
+        later = shift.get(pid, 0)
+        for field in _TIMES:
+            at = 1 + layout.fields.index(field) if field in layout.fields else 0
+            if at and isinstance(rest[at], int):
+                rest[at] += later
+        others.append((layout, min(max(0, time + later), NEVER - 1), pid, *rest))
     return events._replace(
         table=table[sort_by(table['time'], table['place'])],
-        others=sorted(others, key=lambda event: event[1]))
+        others=sorted(others, key=lambda event: event[1]), shift={
+            pid: shift.get(pid, 0) + events.shift.get(pid, 0) for pid in {*shift, *events.shift}})
+
+
+class Listener(Protocol):
+    """Receives the events of some kinds."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Return the full names of the kinds."""
+
+    def take(self, name: str, events: Any, places: Ints) -> None:
+        """Receive events of a kind, and their places in the file."""
 
 
 def read_events(
     reader: TraceReader, kinds: Mapping[str, tuple[Any, ...]], others: Sequence[str],
-    progress: Function[[int], None] | None = None,
+    progress: Function[[int], None] | None = None, listener: Listener | None = None,
 ) -> Events:
-    """Return the events of a trace: those of ``kinds`` as a table, and ``others`` as tuples."""
+    """
+    Return the events of a trace: those of ``kinds`` as a table, and ``others`` as tuples.
+
+    :param listener: also receives those events of its names that have columns.
+    """
+    heard = () if listener is None else listener.names
     parts: list[Table] = [rows(_EVENT)]
     tuples: list[tuple[int, Event]] = []
     names_of: dict[tuple[int, int], str] = {}
     count = 0
-    for batch in reader.batches({*kinds, *others, *BEFORE_HUMBLE, PROCESS}, as_table=False):
+    for batch in reader.batches(
+            {*kinds, *others, *heard, *BEFORE_HUMBLE, PROCESS}, as_table=False):
         for head, table, places in batch.tables:
             if head[0].name in BEFORE_HUMBLE:
                 raise TraceError(reader.path, BEFORE_HUMBLE_PROBLEM, BEFORE_HUMBLE_REMEDY)
+            if listener is not None and head[0].name in heard:
+                listener.take(head[0].name, table, places)
             if head[0].name in kinds:
                 parts.append(_normal(table, places, kinds[head[0].name]))
+            elif head[0].name in heard:
+                continue
             if head[0].name not in kinds or head[0].name in others:
                 tuples += zip(places.tolist(), (head + row for row in table.tolist()))
         for place, event in batch.others:
             layout = event[0]
+            if layout.name in heard and layout.name not in kinds:
+                continue
             if layout.name == PROCESS:
                 names_of[event[2], event[3]] = str(event[4])
                 continue

@@ -57,6 +57,7 @@ from mddag_executor.sources.imported_jobs import ImportedJobs, SKIPPED
 from mddag_executor.sources.links import Links, Oddities
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
+from mddag_executor.trace.events import Event
 from mddag_executor.trace.schema import DAMAGED, DISCARDED, HOST, MISSING
 from mddag_executor.trace.times import credible
 from msg_graph import Process, TaskSet
@@ -102,18 +103,14 @@ class ImportedRun:
     ) -> None:
         self._reader = reader
         self.name = name
-        with named_errors(reader.path, name):
-            self._events = self._with_unfinished(read_events(
-                reader, self.kinds, self.others, progress))
+        self._events = self._with_unfinished(self._read(progress))
         give_back()     # memory of the batches
         # this executor recorded it, but its executions are lost
         own = any(event[0].name in _OWN for event in self._events.others)
         if head is None and (own or not (self._events.table['kind'] == START).any()):
             raise no_run(reader)
         self._link()
-        self._clocks = ImportedClocks(self.links, {
-            event[2]: (event[4], event[5]) for event in self._events.others
-            if event[0].name == HOST})
+        self._clocks = ImportedClocks(self.links, hosts_in(self._events.others))
         if self._clocks.shift:
             self._events = moved(self._events, self._clocks.shift)
             self._link()
@@ -133,6 +130,11 @@ class ImportedRun:
         self.end = max(min(max(0, self.head.time), NEVER - 1), *self._last_times())
         self._odd = Oddities(self.odd, 5)
         self._fallbacks: Counter[str] = Counter()
+
+    def _read(self, progress: Function[[int], None] | None) -> Events:
+        """Return the events."""
+        with named_errors(self._reader.path, self.name):
+            return read_events(self._reader, self.kinds, self.others, progress)
 
     def _link(self) -> None:
         """Link executions and messages."""
@@ -335,23 +337,28 @@ class ImportedRun:
 
     def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
         """Return by execution when it was ready, and by source execution its release."""
-        runs, messages, start = self.links.runs, self.links.messages, self.links.runs['start']
+        ready = self._ready()
+        timers = np.flatnonzero(self._is_any('timer')[self.links.runs['callback']])
+        ready[timers] = self._due(timers, self.links.runs['start'][timers])
+        return ready, self._releases(jobs, ready, 'timer')
+
+    def _ready(self) -> Ints:
+        """Return when executions were ready by their messages; else when they started."""
+        runs, messages = self.links.runs, self.links.messages
         sent = self._stamps('stamp')
         if len(messages):
             message = messages[runs['message']]
             published = np.where(
                 message['stamp'] != 0, message['stamp'] + self._of_sender, message['time'])
             sent = np.where((sent == 0) & (runs['message'] >= 0), published, sent)
-        ready = np.minimum(np.where(sent != 0, sent, _arrival(runs)), start)
-        timers = np.flatnonzero(self._is_any('timer')[runs['callback']])
-        ready[timers] = self._due(timers, start[timers])
-        return ready, self._releases(jobs, ready, 'timer')
+        ready: Ints = np.minimum(np.where(sent != 0, sent, _arrival(runs)), runs['start'])
+        return ready
 
     @property
     def _of_sender(self) -> Ints:
         """Return by execution how the clock of the sender of its message was moved, ns."""
         at = self.links.messages['at']
-        shift = self._clocks.shifts[self._events.table['thread'][at]]
+        shift = self.links.shift[self._events.table['thread'][at]]
         found: Ints = np.append(shift, 0)[self.links.runs['message']]
         return found
 
@@ -412,11 +419,16 @@ class ImportedRun:
 
     # --- warnings --------------------------------------------------------------------------------
 
+    def _damage(self) -> Iterator[Loss]:
+        """Yield what is damaged."""
+        yield from damage(self._reader.warnings, self._reader.path, self.name)
+
     def _missing(self, found: Recording) -> Iterator[Loss]:
         """Yield missing or doubtful data."""
-        name, path = self.name, self._reader.path
-        yield from damage(self._reader.warnings, path, name)
-        named = [all(those) for those in zip(*self._events.threads)]
+        name = self.name
+        yield from self._damage()
+        named = [all(those) for those in zip(*(
+            self._events.threads[each] for each in distinct(self.links.runs['thread']).tolist()))]
         if self._imported and not all(named):
             lacking = [what for what, has in zip(('vpid', 'vtid'), named) if not has]
             yield Loss('strange', 1, (
@@ -431,6 +443,8 @@ class ImportedRun:
         if self._events.warning:
             yield Loss('strange', 1, f'{name}: {self._events.warning}')
         for cause, count in sorted(self.links.gaps.items()):
+            if not count:
+                continue
             what, things = _LOST.get(cause, self.lost)
             yield Loss('events', count, (
                 f'{name}: {what.format(counted(count, things))}: executions and messages may be '
@@ -457,6 +471,12 @@ class ImportedRun:
                 f'declared one is not recorded or years away: {listed(list(self._fallbacks))}'))
         if found.task_set.dags and not len(found.releases):
             yield no_jobs(name)
+
+
+def hosts_in(events: Sequence[Event]) -> dict[int, tuple[str, str]]:
+    """Return by process its computer, if it is known: its name, and that of its boot."""
+    return {event[2]: (event[4], event[5]) for event in events if event[0].name == HOST
+            and [type(each) for each in event[4:6]] == [str, str]}
 
 
 def process_names(pids: Sequence[int], names: Mapping[tuple[int, int], str]) -> list[str]:

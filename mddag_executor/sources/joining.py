@@ -48,7 +48,7 @@ from mddag_executor.recording.tables import ALL_LEGS, Columns, NOTHING, TABLES, 
 from mddag_executor.sources import clocks
 from mddag_executor.sources.entities import Entities
 from mddag_executor.sources.executions import Numbering
-from mddag_executor.sources.head import declared, read_head
+from mddag_executor.sources.head import declared, no_run, read_head
 from mddag_executor.sources.joined_jobs import JoinedJobs, Released
 from mddag_executor.sources.own import begin_of, end_losses, Read, read_process
 from mddag_executor.text import counted, listed
@@ -103,7 +103,7 @@ class _Part:
         self.reader = TraceReader(path)
         head = read_head(self.reader)
         if head is None:
-            raise ReplayError(path, 'it was not recorded by this executor', 'replay it by itself')
+            raise no_run(self.reader)
         if not is_declared(head):
             raise ReplayError(
                 path, 'it was recorded without a declaration, so its jobs have no names that '

@@ -166,13 +166,15 @@ class Links:
         0: unknown), ``within`` (only within the process).
     :ivar topics: numbers of topics by name; ``topic_of``: by message the number of its topic.
     :ivar takes: executions with messages that they took themselves.
-    :ivar threads: process and thread id, by index.
+    :ivar threads: process and thread id, by index; ``is_own``: whether this executor ran it.
+    :ivar shift: by thread what was added to its times, ns.
     :ivar lost: signs of missing events, in the order of time: the fields of ``Lost``.
     """
 
     def __init__(self, events: Events, who: Entities) -> None:
         self.events, self.who, self.losses = events.table, who, Oddities(_SAID, 3)
-        self.threads = events.threads
+        self.threads, self.shift = events.threads, events.of_threads(events.shift)
+        self.is_own: Mask = events.of_threads(dict.fromkeys(events.own, 1)) > 0
         self._pid = np.array([pid for pid, _ in events.threads], dtype=np.int64)
         kind = self.events['kind']
         gaps = self.events[kind == LOST]

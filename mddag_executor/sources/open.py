@@ -25,6 +25,8 @@ class Traces:
     """
     The traces of the processes of one run.
 
+    One of them may be an imported recording, of the processes that other executors ran.
+
     :ivar paths: paths of the traces, at least one.
     :ivar offsets: how far the clocks of other machines are ahead of the first trace's clock, ns,
         by the last word of the trace's name (``control`` of ``run.control.mcap``).  Missing
@@ -66,10 +68,7 @@ def open_recording(
     if isinstance(task_set, (str, os.PathLike)):
         task_set = load(task_set)
     if not isinstance(path, (str, os.PathLike, TraceReader)):
-        traces = path if isinstance(path, Traces) else Traces(path)
-        from mddag_executor.sources.joining import Joined
-        paths = [os.fspath(each) for each in traces.paths]
-        return judged_by(Joined(paths, traces.offsets).recording(progress), task_set)
+        return _of_several(path if isinstance(path, Traces) else Traces(path), task_set, progress)
     path, reader = _opened(path)
     name = name or path
     if reader is None:
@@ -86,6 +85,21 @@ def open_recording(
             return judged_by(read_own(reader, name, head, progress), task_set)
         from mddag_executor.sources.undeclared_run import UndeclaredRun
         return UndeclaredRun(reader, name, task_set or EMPTY_TASK_SET, head, progress).read()
+
+
+def _of_several(
+    traces: Traces, task_set: TaskSet | None, progress: Progress | None
+) -> Recording:
+    """Return the recording of a run that has several; one may be imported."""
+    paths = [os.fspath(each) for each in traces.paths]
+    if all(read_head(TraceReader(path)) is not None for path in paths):
+        from mddag_executor.sources.joining import Joined
+        return judged_by(Joined(paths, traces.offsets).recording(progress), task_set)
+    if traces.offsets:
+        raise UsageError('--offset: with an imported recording clocks of computers are compared '
+                         'by messages: leave the option out')
+    from mddag_executor.sources.mixed_run import MixedRun
+    return MixedRun(paths, task_set, progress).read()
 
 
 def open_to_draft(
@@ -129,6 +143,11 @@ def check_declared(path: Given, name: str) -> None:
                 from mddag_executor.sources.imported_run import ImportedRun
                 ImportedRun(reader, name, None)     # None: the trace is an imported one
                 raise undeclared(name)
+        return
+    traces = path if isinstance(path, Traces) else Traces(path)
+    heads = [read_head(TraceReader(each)) for each in traces.paths]
+    if not any(head is not None and is_declared(head) for head in heads):
+        raise without_declaration(name)
 
 
 def undeclared(name: str, imported: bool = True) -> ReplayError:

@@ -36,6 +36,7 @@ the causes of executions.  Differences:
 
 from __future__ import annotations
 
+from collections.abc import Callable as Function
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -50,6 +51,7 @@ from mddag_executor.sources.executions import number_pieces
 from mddag_executor.sources.head import no_end, steps
 from mddag_executor.sources.imported_events import (
     computed,
+    DISPATCH,
     END,
     Events,
     OWN_KINDS,
@@ -64,7 +66,7 @@ from mddag_executor.sources.stamps import find_stamps, Sent
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
-_DROP, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP = (
+_DROP, _MESSAGES_LOST, _UNFINISHED, CLOCK_STEP = (
     'mddag:drop', 'mddag:messages_lost', 'mddag:unfinished', 'mddag:clock_step')
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
@@ -74,11 +76,17 @@ _ONE_OF = 20
 _A_LITTLE = 100
 
 
-class _OwnLinks(Links):
-    """The executions and messages of this executor (rules 1 and 2)."""
+class OwnLinks(Links):
+    """
+    The executions and messages of this executor (rules 1 and 2); those of others as in ``Links``.
+
+    :ivar own_runs: by execution whether this executor ran it.
+    """
 
     def _stamp_messages(self) -> Ints:
         """Find the source timestamps of publications (rule 2)."""
+        everything = self.is_own.all()
+        others = super()._stamp_messages() if not everything else np.empty((0, 2), dtype=np.int64)
         table, found = self.events, self.messages
         kind = table['kind']
         sent = np.zeros(len(table), dtype=np.bool_)
@@ -90,38 +98,73 @@ class _OwnLinks(Links):
         at = np.flatnonzero(stops)
         mine = (before >= 0) & sent[before]
         ends[self._row[before[mine]]] = table['time'][at[mine]]
-        takes = np.flatnonzero((kind == TAKE) & (self._subscription >= 0))
-        topics = self._numbers(each[0].start for each in self.taken)[self._subscription[takes]]
+        begins = found['time']
+        if self.shift.any():    # the middleware stamps by the clock of the system
+            shift = self.shift[table['thread'][found['at']]]
+            begins = begins - shift
+            ends[ends < NEVER] -= shift[ends < NEVER]
+        takes, topics = self._stamped_takes()
         # several subscriptions may take a message: its first take counts
         order = sort_by(topics, table['b'][takes])
         stamps = table['b'][takes[order]]
         new = np.append(True, (np.diff(topics[order]) != 0) | (np.diff(stamps) != 0))[:len(takes)]
         first = np.sort(order[new])
         takes, topics = takes[first], topics[first]
+        numbers = np.where(kind[takes] == TAKE, table['d'][takes], 0)
+        is_own = self.is_own[table['thread'][found['at']]]
         several: list[tuple[int, int]] = []
         for topic, (mine, asked) in enumerate(zip(*(
                 rows_by(each, len(self.topics) + 1) for each in (self.topic_of, topics)))):
+            if not everything:      # publications of others have recorded their timestamps
+                known = found['stamp'][mine[~is_own[mine]]]
+                mine = mine[is_own[mine]]
+                mine = mine[sort_by(begins[mine])]
+                asked = asked[~np.isin(table['b'][takes[asked]], known)]
             at = takes[asked]
             found['stamp'][mine], doubtful = find_stamps(
-                Sent(found['time'][mine], ends[mine], found['publisher'][mine]),
-                table['b'][at], table['d'][at])
+                Sent(begins[mine], ends[mine], found['publisher'][mine]),
+                table['b'][at], numbers[asked])
             several += [(topic, stamp) for stamp in doubtful]
-        return np.array(several, dtype=np.int64).reshape(-1, 2)
+        return np.concatenate([
+            others, np.array(several, dtype=np.int64).reshape(-1, 2)])
+
+    def _stamped_takes(self) -> tuple[Ints, Ints]:
+        """Return the events that say which messages were taken, and the topics of each."""
+        kind = self.events['kind']
+        takes = np.flatnonzero((kind == TAKE) & (self._subscription >= 0))
+        topics = self._numbers(each[0].start for each in self.taken)[self._subscription[takes]]
+        dispatched = np.flatnonzero((kind == DISPATCH) & (self.events['b'] != 0))
+        if not len(dispatched):
+            return takes, topics
+        found = np.concatenate([takes, dispatched])
+        order = sort_by(found)
+        return found[order], np.concatenate([topics, self._numbers(
+            each.start for each in self.callbacks)[self._callback[dispatched]]])[order]
 
     def _takes(self) -> tuple[Ints, Ints]:
-        none = np.empty(0, dtype=np.int64)      # the executor takes messages in any thread
-        return none, none
+        """Return what executions of others took themselves; this executor takes in any thread."""
+        if self.is_own.all():
+            none = np.empty(0, dtype=np.int64)
+            return none, none
+        runs, messages = super()._takes()
+        others = ~self.own_runs[runs]
+        return runs[others], messages[others]
 
     def _arrivals(self) -> Ints:
         """Find the taken message of each execution (rule 1)."""
         table = self.events
         runs, time = self.runs, table['time']
-        began, start = runs['at'], runs['start']
-        ready, due = table['b'][began], table['c'][began]
+        self.own_runs: Mask = self.is_own[runs['thread']]
+        own = np.flatnonzero(self.own_runs)
         taken_at = np.full(len(runs), -1)
+        if len(own) < len(runs):
+            taken_at = np.where(self.own_runs, -1, super()._arrivals())
+        began, start = runs['at'][own], runs['start'][own]
+        ready, due = np.full(len(runs), -1), np.zeros(len(runs), dtype=np.int64)
+        ready[own], due[own] = table['b'][began], table['c'][began]
         taken = np.flatnonzero(table['kind'] == TAKE)
         takes_by = rows_by(self._subscription[taken], len(self.taken))
-        runs_by = rows_by(runs['callback'], len(self.callbacks))
+        runs_by = rows_by(runs['callback'][own], len(self.callbacks))
         subscriptions: dict[int, list[int]] = {}
         for number, callbacks in enumerate(self.taken):
             for one in {id(callback) for callback in callbacks}:
@@ -129,15 +172,19 @@ class _OwnLinks(Links):
         for callback, these in zip(self.callbacks, runs_by):
             mine = np.sort(np.concatenate([taken[:0], *(
                 taken[takes_by[each]] for each in subscriptions.get(id(callback), ()))]))
-            these = these if len(mine) else mine
+            these = own[these] if len(mine) else mine
             place = as_of(time[mine], ready[these])
             these, place = these[place >= 0], place[place >= 0]
             # a message starts one execution; its pieces have the same ready time
             _, first, which = np.unique(place, return_index=True, return_inverse=True)
             same = ready[these] == ready[these[first[which]]]
             taken_at[these[same]] = mine[place[same]]
-        runs['ready'] = np.clip(ready, 0, start)
-        runs['due'] = np.where((due > 0) & (due <= runs['ready']), due, 0)
+        runs['ready'][own] = np.clip(ready[own], 0, start)
+        due = np.where((due > 0) & (due <= runs['ready']), due, 0)
+        is_timer = np.array([each.kind == 'timer' for each in self.callbacks], dtype=np.bool_)[
+            runs['callback']]
+        runs['due'] = np.where(is_timer, due, 0)
+        runs['stated'] = np.where(is_timer, 0, due)     # a header stamp
         return taken_at
 
 
@@ -145,14 +192,20 @@ class UndeclaredRun(ImportedRun):
     """A run of this executor that was recorded without a declaration."""
 
     kinds = OWN_KINDS
-    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP)
-    links_type = _OwnLinks
+    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED, CLOCK_STEP)
+    links_type: type[OwnLinks] = OwnLinks
+    links: OwnLinks
     lost = '{} lost while recording', 'event'
     odd = {**OFF_THE_GRID, 'off': (
         'execution', 'of timers whose due times are not recorded and that kept to no period '
         '(reset, or by another clock): released when they were noticed'), 'skipped': (
         'release', 'of undeclared timers skipped, as the one before began later than they were '
         'due')}
+
+    def _read(self, progress: Function[[int], None] | None) -> Events:
+        events = super()._read(progress)
+        return events._replace(own=frozenset([
+            *(pid for pid, _ in events.threads), *(event[2] for event in events.others)]))
 
     def _with_unfinished(self, events: Events) -> Events:
         """Add the starts of executions that have not ended (rule 6)."""
@@ -193,12 +246,20 @@ class UndeclaredRun(ImportedRun):
 
     def _unfinished(self, mine: Ints) -> list[tuple[int, int, str]]:
         runs, table = self.links.runs, self._events.table
+        start = runs['start'][mine] - self._moved[runs['thread'][mine]]
         keys = zip(runs['thread'][mine].tolist(), table['a'][runs['at'][mine]].tolist(),
-                   runs['start'][mine].tolist())
+                   start.tolist())
         return [self._found.get(key, (0, UNKNOWN, '')) for key in keys]
 
+    @property
+    def _moved(self) -> Ints:
+        """Return by thread what was added to its times after they were read, ns."""
+        return self._events.of_threads(self._clocks.shift)
+
     def _have_workers(self, mine: Ints) -> list[bool]:
-        return [worker >= 0 for _, worker, _ in self._unfinished(mine)]
+        own = self.links.own_runs[mine].tolist()
+        return [worker >= 0 or not is_own
+                for (_, worker, _), is_own in zip(self._unfinished(mine), own)]
 
     def _places(self, mine: Ints) -> list[str]:
         return [where for _, _, where in self._unfinished(mine)]
@@ -209,13 +270,18 @@ class UndeclaredRun(ImportedRun):
         return table
 
     def _number_pieces(self, table: Table) -> None:
-        number_pieces(table, np.arange(len(table)), 'callback', table['completes'] == NOTHING)
+        own = np.flatnonzero(self.links.own_runs)
+        number_pieces(table, own, 'callback', table['completes'][own] == NOTHING)
 
     def _missing(self, found: Recording) -> Iterator[Loss]:
         yield from super()._missing(found)
+        yield from self._missing_end(found)
+
+    def _missing_end(self, found: Recording) -> Iterator[Loss]:
+        """Yield steps of the clock, and whether the end is missing."""
         yield from steps(self.name, [
             event[4] for event in self._events.others
-            if event[0].name == _CLOCK_STEP and isinstance(event[4], int)])
+            if event[0].name == CLOCK_STEP and isinstance(event[4], int)])
         if not found.run.shut_down:
             yield no_end(self.name)
 
@@ -250,17 +316,21 @@ class UndeclaredRun(ImportedRun):
         return int(ends[-1]) if len(ends) else self.end
 
     def _times(self, jobs: ImportedJobs) -> tuple[Ints, Ints]:
-        number, ready = self.links.runs['callback'], self.links.runs['ready'].copy()
-        due = self.links.runs['due']
+        number, own = self.links.runs['callback'], self.links.own_runs
+        due, is_timer = self.links.runs['due'], self._is_any('timer')[number]
+        ready = self.links.runs['ready'].copy()
+        if not own.all():
+            ready = np.where(own, ready, self._ready())
+            timers = np.flatnonzero(is_timer & ~own)
+            ready[timers] = self._due(timers, self.links.runs['start'][timers])
         for callback, mine in zip(
                 self.links.callbacks, rows_by(number, len(self.links.callbacks))):
-            times = distinct(ready[mine[due[mine] == 0]])
+            times = distinct(ready[mine[(due[mine] == 0) & own[mine]]])
             if callback.kind == 'timer' and len(times):
                 callback.grid = _grid(times, callback.period)
         # the time at which a request was taken is not recorded
         release = self._releases(jobs, ready, 'timer', 'service')
-        timer = self._is_any('timer')[number[jobs.sources]]
-        timer &= due[jobs.sources] == 0
+        timer = (is_timer & own & (due == 0))[jobs.sources]
         mine = jobs.sources[timer]
         release[timer] = self._due(mine, ready[mine])
         return ready, np.where(due[jobs.sources] > 0, due[jobs.sources], release)
@@ -300,11 +370,11 @@ class UndeclaredRun(ImportedRun):
     def _pieces(self) -> tuple[Ints, Mask]:
         """Return the first pieces of executions, and which end them (rule 4)."""
         runs = self.links.runs
-        first = np.arange(len(runs))
-        order = sort_by(runs['callback'], runs['ready'])
+        first, own = np.arange(len(runs)), np.flatnonzero(self.links.own_runs)
+        order = own[sort_by(runs['callback'][own], runs['ready'][own])]
         number, ready = runs['callback'][order], runs['ready'][order]
-        again = np.append(False, (np.diff(number) == 0) & (np.diff(ready) == 0))[:len(runs)]
-        first[order] = order[np.maximum.accumulate(np.where(again, 0, first))]
+        again = np.append(False, (np.diff(number) == 0) & (np.diff(ready) == 0))[:len(order)]
+        first[order] = order[np.maximum.accumulate(np.where(again, 0, np.arange(len(order))))]
         newest, lost = np.full(len(runs), UNKNOWN), np.zeros(len(runs), dtype=np.bool_)
         np.maximum.at(newest, first, runs['end_at'])
         lost[first[runs['end_at'] < 0]] = True

@@ -36,7 +36,7 @@ Theory of operation:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 import os
 from pathlib import Path
@@ -165,14 +165,15 @@ def _written(
         known = [sessions[0].host for sessions in hosts]
         for sessions, host in zip(hosts, known):
             several = sum(each.parts for each in sessions) > 1
-            # sessions that name one host, but contradict each other, are of unknown hosts
-            importer.begin(several, host if host[1] and known.count(host) == 1 else None)
             try:
                 reading = Reading({folder: metadata for each in sessions
                                    for folder, metadata in each.traces.items()}, raw=several)
             except MetadataError as error:
                 raise TraceError(
                     name, f'its metadata cannot be read ({error})', _RECORD) from None
+            # sessions that name one host, but contradict each other, are of unknown hosts
+            importer.begin(several, host if host[1] and known.count(host) == 1 else None,
+                           reading.offsets)
             for events, lost in reading.batches():
                 importer.take(events, lost)
                 if progress is not None:
@@ -370,20 +371,22 @@ class _Importer:
         self._targets: dict[int, _Target] = {}      # by identity of the kind
         self._names: set[str] = set()               # of events
         self._host: _Host | None = None
+        self._offsets: Mapping[int, int] = {}       # of its clock, by trace
         self._hosted: set[int] = set()              # processes of which the host is written
         self._procnames: dict[int, bytes] = {}      # by process and thread in one number
         self._nameless = 0                          # events without process or thread
         self._impossible = 0                        # events of impossible processes or threads
 
-    def begin(self, several: bool, host: _Host | None) -> None:
+    def begin(self, several: bool, host: _Host | None, offsets: Mapping[int, int]) -> None:
         """
         Begin with the next host.
 
         :param several: whether it has several sessions.
         :param host: what it is called; None: unknown.
+        :param offsets: by number of a trace from the 0 of its clock to that of its times, ns.
         """
         self._place += 1
-        self._host = host
+        self._host, self._offsets = host, offsets
         self._repeated += self._several.repeated if self._several else 0
         self._several = _Several() if several else None
 
@@ -414,8 +417,10 @@ class _Importer:
         order[np.argsort(keys, kind='stable')] = np.arange(len(keys))
         of_events, of_hosts, of_names, of_gaps = np.split(order, np.cumsum([
             len(events), len(met), len(renamed)]))
+        name = self._host or ('', '')
         tables = [Columns(HOST, of_hosts, events.time[met], vpid[met], vtid[met],
-                          [self._host or ('', '')] * len(met)),
+                          [(*name, self._offsets.get(each, 0) if name[1] else 0)
+                           for each in events.trace[met].tolist()]),
                   Columns(PROCESS, of_names, events.time[renamed], vpid[renamed], vtid[renamed],
                           [(name,) for name in names]),
                   self._gaps(gaps, of_gaps)]

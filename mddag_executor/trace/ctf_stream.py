@@ -177,6 +177,8 @@ class Reading:
     :param folders: the metadata of each of their folders, by folder.
     :param raw: whether the bytes of each event are wanted.
     :ivar damages: what is wrong, after the events were read.
+    :ivar offsets: by number of a trace from the 0 of its clock to that of its times, ns, if
+        credible.
     """
 
     def __init__(self, folders: dict[str, Metadata], raw: bool) -> None:
@@ -193,6 +195,9 @@ class Reading:
                 number = traces[key].number if key in traces else len(traces)
                 traces[key] = Trace(metadata, number, raw)
             self._add(traces[key], folder)
+        self.offsets = {
+            each.number: offset for each in traces.values()
+            if 0 < (offset := each.metadata.clock.offset) < NEVER}
 
     def _add(self, trace: Trace, folder: str) -> None:
         """Take the files of a trace in a folder."""

@@ -147,8 +147,9 @@ _ALL = (
            default_deadline=_I64, max_active_jobs=_I32, preemptive=_BOOL, cpus=_I32,
            on_late=_I32),
     # the boot of the machine that the steady clock counts from, '': unknown; `import ctf` writes
-    # one for each process
-    _event('mddag', 'host', name=_STR, boot=_STR),
+    # one for each process, and what turns the steady clock into its times (0: unknown), which
+    # `caret_init` says of this executor
+    _event('mddag', 'host', (0,), name=_STR, boot=_STR, clock_offset=_I64),
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     # the callback is of a program that runs its callbacks one at a time; the number of the program
     _event('mddag', 'program', callback=_U64, program=_I64),

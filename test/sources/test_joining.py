@@ -275,7 +275,7 @@ def test_traces_of_different_runs_are_refused(tmp_path):
     empty = str(tmp_path / 'empty.mcap')
     with TraceFile(empty) as file:
         file.add('callback_start', 5, 1, 1, 7, False)
-    with pytest.raises(ReplayError, match='not recorded by this executor'):
+    with pytest.raises(ReplayError, match='it is of another run than'):
         replay([up, empty])
 
 

@@ -288,7 +288,7 @@ def test_the_host_of_each_process_is_known(tmp_path):
         import_ctf(given, tmp_path / 'out.mcap', overwrite=True)
         events = list(TraceReader(tmp_path / 'out.mcap').events({'mddag:host', START[0]}))
         found = [event for event in events if event[0] == 'mddag:host']
-        assert [event[4:] for event in found] == hosts
+        assert [event[4:] for event in found] == [(*host, CLOCK_OFFSET) for host in hosts]
         assert len({event[2] for event in found}) == len(hosts)
         for host in found:
             assert next(event for event in events if event[2] == host[2]) == host
