@@ -49,6 +49,8 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import Waitable
 
+TIMER_NS = 1_000_000
+"""How late a timer within a waitable may be noticed that is due earlier than it was before."""
 SENDER_CHECKS = 500
 """For how many ms to wait with a response until its request is noted (7.1.5)."""
 
@@ -238,6 +240,8 @@ class WaitableSource(ChannelSource):
         self._lock = threading.Lock()
         self._has_more = False
         self._ignored = False
+        # when it is asked next because of a timer, monotonic ns
+        self._asks_at = 0
 
     def _add_part(self, kind: str, address: int) -> None:
         self._has_parts = True
@@ -319,7 +323,18 @@ class WaitableSource(ChannelSource):
             times = [timer.until() for timer in self._timers]
         for until in times:
             if until is not None and until > 0:  # else its handling is posted, which resets it
-                self._pool.call_at(time.monotonic_ns() + until, self._ask)
+                self._ask_in(until)
+
+    def _ask_in(self, ns: int) -> None:
+        """
+        Collect again after a time, unless that is done by then anyway.
+
+        A collection for each arrival would lead to one more each time that the timer is due.
+        """
+        now = time.monotonic_ns()
+        if not now < self._asks_at <= now + ns + TIMER_NS:
+            self._asks_at = now + ns
+            self._pool.call_at(now + ns, self._ask)
 
     def _post_noted(self, found: list[Work], checks: int = 0) -> None:
         """Post executions; a response only after the sending thread has noted the request."""

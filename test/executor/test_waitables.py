@@ -21,6 +21,7 @@ from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
 
 from .conftest import is_idle, patience, Pulse, Spinning, wait_for
+from .inside import pool_of
 
 SUCCEEDED, CANCELED = 4, 5
 QOS = QoSProfile(depth=100)
@@ -83,6 +84,19 @@ def test_many_goals_at_once(make_executor, make_node, apart):
     for order, task in enumerate(tasks[:8], 1):
         assert task.result() == (SUCCEEDED, [*range(order)], [*range(1, order + 1)])
     assert [task.result()[0] for task in tasks[8:]] == [CANCELED] * 2
+    counting.destroy()
+
+
+def test_the_server_of_many_goals_is_asked_once_when_the_first_one_expires(
+        make_executor, make_node):
+    node = make_node()
+    counting = Counting(node, node, result_timeout=300.0)
+    executor = make_executor(nodes=[node])
+    for _ in range(10):
+        task = executor.create_task(counting.ask(2))
+        executor.spin_until_future_complete(task, patience(15.0))
+        assert task.result()[0] == SUCCEEDED
+    assert pool_of(executor).agenda._appointments <= 3
     counting.destroy()
 
 
