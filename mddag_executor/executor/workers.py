@@ -162,6 +162,8 @@ class WorkerPool:
         self._all_left = threading.Event()
         #: whether the thread of a ``spin_once`` runs everything
         self.is_spin_once = False
+        # whether groups that have refused an execution will be asked again at a time
+        self._asks_later = False
         # coroutines that have yielded: they continue in the next step
         self._of_next_turn: list[Work] = []
         self._loops: Loops | None = None
@@ -734,8 +736,10 @@ class WorkerPool:
             me.has_lent = False
         if isinstance(outcome, Refused):
             engine.refused(work, now)
-            self.due.call_at(
-                now - self.offset + AGAIN_NS, partial(self.report, lambda _: engine.ask_again()))
+            if not self._asks_later:
+                self._asks_later = True
+                self.due.call_at(
+                    now - self.offset + AGAIN_NS, partial(self.report, self._ask_again))
             return
         if outcome is None:
             engine.finished(work, start, end, now, me.vtid, worker)
@@ -754,6 +758,11 @@ class WorkerPool:
                 self.fail(outcome)  # at once: the spin may be about to end
             elif not is_gone:
                 self.unlocked_calls.append(partial(self._report_error, work, outcome))
+
+    def _ask_again(self, _: int) -> None:
+        """Ask the callback groups again that have refused executions."""
+        self._asks_later = False
+        self.engine.ask_again()
 
     def _report_error(self, work: Work, error: BaseException) -> None:
         if self.callback_ended is None or not self.callback_ended(

@@ -424,6 +424,20 @@ def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, make_node):
     assert gated['ran'] == len(ran) and gated['dropped'] == 0 < gated['skipped']
 
 
+def test_a_group_that_has_refused_often_is_asked_again_once_at_a_time(make_executor, make_node):
+    """Not once for each refusal: each of these would lead to a further one."""
+    node, group, calls = make_node(), Tokens(), []
+    node.create_timer(0.001, lambda: None, callback_group=group)
+    executor = make_executor(num_workers=1, nodes=[node])
+    agenda = pool_of(executor).agenda
+    with Spinning(executor):
+        assert wait_for(lambda: group.asked)
+        tasks = [executor.create_task(lambda: calls.append(agenda._appointments))
+                 for _ in range(100)]
+        assert wait_for(lambda: all(task.done() for task in tasks))
+    assert len(calls) == 100 and max(calls) <= 5
+
+
 def test_messages_that_a_group_keeps_waiting_are_as_many_as_the_qos_says(make_executor, make_node):
     """
     The oldest go, and are counted (rclcpp#3213).
