@@ -12,7 +12,9 @@ Theory of operation
     take it before the sending one knows the number.  Requests of a client are sent one after the
     other, so a request that is not older than the one that is just being sent is this one.
 3.  A request to an action is identified by its goal.
-4.  Another note is for the response: its callbacks inherit the same.
+4.  Another note is for the response: its callbacks inherit the same.  When the response is taken,
+    the note of its request is removed as well: the request went to another process, or another
+    thread took it before it was noted.
 5.  *Delivery within the process.*  The middleware delivers within ``send``.  So the sending thread
     takes the request itself (its *receivers*), and the thread that sends the response takes that
     one.  Otherwise the worker would begin something less urgent before it knows of them.
@@ -40,8 +42,8 @@ class SentRequests:
     """The requests of one executor.  Any thread may note one, without a lock."""
 
     def __init__(self) -> None:
-        # by what identifies a request, or the response to it
-        self._notes: dict[Any, Heritage] = {}
+        # by what identifies a request, or the response to it; the latter with the request
+        self._notes: dict[Any, tuple[Heritage, Any]] = {}
         # by client: what the request inherits that is just being sent, and since when
         self._sending: dict[bytes, tuple[Heritage, int]] = {}
         # what takes the arrivals of a service, by its name; of action servers; of clients
@@ -88,7 +90,7 @@ class SentRequests:
             self._note((sender, number), heritage)
         finally:
             self._sending.pop(sender, None)
-        self._note((client, SERVICE, number), heritage)
+        self._note((client, SERVICE, number), heritage, (sender, number))
         self._receive(service)
         return number
 
@@ -102,16 +104,24 @@ class SentRequests:
         """
         self._note((kind, goal), heritage)
         number = send()
-        self._note((client, kind, number), heritage)
+        self._note((client, kind, number), heritage, (kind, goal))
         self._receive(ACTION)
         return number
 
-    def _note(self, key: Any, heritage: Heritage) -> None:
+    def _note(self, key: Any, heritage: Heritage, request: Any = None) -> None:
+        """Note what a request inherits, or the callbacks of the response to a request."""
         notes = self._notes
-        notes[key] = heritage
-        if len(notes) > 4 * MOST:  # of other processes, or never answered
+        notes[key] = heritage, request
+        if len(notes) > 4 * MOST:  # they are never answered
             for old in list(notes)[:MOST]:
                 notes.pop(old, None)
+
+    def _pop(self, key: Any) -> Heritage | None:
+        """Return and remove a note; that of a response with the one of its request."""
+        heritage, request = self._notes.pop(key, (None, None))
+        if request is not None:
+            self._notes.pop(request, None)
+        return heritage
 
     def is_empty(self) -> bool:
         """Return whether no request, and no response, can be found."""
@@ -127,14 +137,14 @@ class SentRequests:
         if sender is None:
             return None
         sending = self._sending.get(sender)  # first: it is noted before this ends
-        found = self._notes.pop((sender, number), None)
+        found = self._pop((sender, number))
         if found is None and sending is not None and stamp >= sending[1] - ROUNDING_NS:
             found = sending[0]
         return found
 
     def of_response(self, client: Any, number: int) -> Heritage | None:
         """Return what the callbacks of the response to a client's request inherit."""
-        return self._notes.pop((client, SERVICE, number), None)
+        return self._pop((client, SERVICE, number))
 
     def of_action(self, keys: Iterable[tuple[Any, ...]]) -> Heritage | None:
         """
@@ -142,5 +152,5 @@ class SentRequests:
 
         :param keys: kind and goal of each request; handle, kind and number of each response.
         """
-        found = [self._notes.pop(key, None) for key in keys]
+        found = [self._pop(key) for key in keys]
         return min((each for each in found if each is not None), default=None)

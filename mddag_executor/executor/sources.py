@@ -9,7 +9,8 @@ order whichever thread takes them.  This costs no parallelism, because rclpy kee
 takes.
 
 Responses complete futures, and messages on ``/clock`` set simulated time.  The spinning thread
-takes both, because callbacks may wait for them (``at_once``).
+takes both, because callbacks may wait for them (``at_once``).  A response to a request that
+inherits is also taken by the thread that has sent it (``sent_requests``).
 
 Anything beyond a bound stays in the middleware: requests beyond ``SERVICE_DEPTH``, and messages
 beyond ``MOST`` if the QoS profile keeps all.  These are collected when a waiting one starts
@@ -299,9 +300,9 @@ class ServiceEntity(ArrivalEntity):
         self._take = compat.request_taker(self.rclpy_object)
         with self.handle:
             self._name = name_of_service(self.handle)
-        rooms.pool.engine.sent_requests.add_receiver(self._name, self.receive)
         self.listen_in(rooms, rooms.pool.loop,
                        f'services {self.node}' if compat.is_builtin(self.rclpy_object) else '')
+        rooms.pool.engine.sent_requests.add_receiver(self._name, self.receive)
 
     def ignore(self) -> None:
         """End ``listen``."""
@@ -348,7 +349,6 @@ class ServiceEntity(ArrivalEntity):
                 if work.heritage is not None:
                     work.then = partial(self._answer, header)
             engine.posted(work, now)
-
 
     def _answer(self, header: Any, response: Any) -> None:
         """Send a response, which the calling thread takes as well."""

@@ -8,12 +8,15 @@ import time
 
 from mddag_executor.core import NEVER, Tables
 from mddag_executor.executor.bounds import MOST
+from mddag_executor.executor.kinds import ListenerEntity
+from mddag_executor.executor.sent_requests import SentRequests
 from mddag_executor.sources.open import open_recording
 from mddag_executor.whatif.load import LoadBuilder
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.exceptions import InvalidHandle
 from std_msgs.msg import Empty
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
@@ -261,6 +264,49 @@ def test_requests_are_forgotten(make_executor, make_node):
     each.clients['silent'].wait_for_service = lambda timeout: True
     each.run()
     assert len(engine_of(each.executor).sent_requests._notes) <= 4 * MOST
+
+
+def test_a_request_to_another_executor_is_forgotten_with_its_response(make_executor, make_node):
+    async def ask(each):
+        for _ in range(3):
+            await each.request('elsewhere')
+
+    each = Asking(make_executor, make_node, ask)
+    elsewhere = make_node('elsewhere')
+    elsewhere.create_service(Trigger, '/elsewhere', lambda request, response: response)
+    each.clients['elsewhere'] = each.node.create_client(Trigger, '/elsewhere')
+    with Spinning(make_executor(None, nodes=[elsewhere])):
+        each.run()
+    assert engine_of(each.executor).sent_requests.is_empty()
+
+
+def test_a_request_that_is_taken_before_it_is_noted_is_forgotten_with_its_response():
+    requests, found = SentRequests(), []
+
+    def send():
+        found.append(requests.of_request(b'client', 7, time.time_ns()))
+        return 7
+
+    requests.send(send, b'client', '/ask', 'handle', (5, 0))
+    assert found == [(5, 0)] and not requests.is_empty()
+    assert requests.of_response('handle', 7) == (5, 0)
+    assert requests.is_empty()
+
+
+def test_a_service_that_is_destroyed_before_it_listens_receives_no_requests(
+        make_executor, make_node, monkeypatch):
+    def destroyed(entity, *_):
+        raise InvalidHandle('the node destroys it')
+
+    node = make_node()
+    executor = make_executor(nodes=[node])
+    service = node.create_service(Trigger, '/brief', lambda request, response: response)
+    with monkeypatch.context() as patch:
+        patch.setattr(ListenerEntity, 'listen_in', destroyed)
+        executor.set_judging(True)  # it notices the service
+    node.destroy_service(service)
+    executor.spin_once(0)
+    assert '/brief' not in engine_of(executor).sent_requests._receivers
 
 
 def test_a_recording_says_what_a_request_has_inherited(make_executor, make_node, tmp_path):
