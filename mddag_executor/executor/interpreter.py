@@ -68,8 +68,8 @@ class Interpreter:
         state = self._state
         if not state.ready:
             return self._patience[-1]
-        queue = state.ready[0][4]
-        return self._patience[state.x_vertex[state.queue_first[queue] if queue >= 0 else ~queue]]
+        # that of the vertex whose deadline it has or inherits; -1: the default one, which is last
+        return self._patience[state.x_like[first_of(state, state.ready[0])]]
 
     def may_be_overtaken(self, now: int) -> bool:
         """Return whether the first waiting execution may overtake the latest holder."""

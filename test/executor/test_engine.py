@@ -33,7 +33,6 @@ HORIZON = 60
 MS = 1_000_000
 
 
-
 def check(engine):
     """Check the invariants that hold between two calls."""
     broken = [*broken_invariants(engine)]
@@ -200,6 +199,19 @@ def test_a_sink_that_ended_in_time_is_in_time_also_if_it_was_reported_overdue(re
     execution, = (event for event in events if event[0] == 'execution')
     assert 40 * MS in execution and 40 * MS + 1 not in execution
     assert not [event for event in events if event[0] == 'deadline']
+
+
+@pytest.mark.parametrize('inherits', [False, True])
+def test_a_request_that_inherits_waits_for_a_short_callback_as_briefly_as_its_client(inherits):
+    task_set = loads(graph(motor='name: drive, timer: 20ms, deadline: 20ms'))
+    engine = new_engine(task_set, workers=2, default_deadline=100 * MS)
+    engine.timer_due(Work(entity_of(engine, task_set, 0, 0), print), 0, 0)
+    urgent = engine.patience()
+    client = engine.step(0, 0).work
+    request = Work(new_entity(), print)
+    request.heritage = engine.heritage(client) if inherits else None
+    engine.posted(request, 0)
+    assert (engine.patience() == urgent) == inherits
 
 
 class OneUser:
