@@ -109,7 +109,9 @@ class Announcements:
         self._publishers: dict[tuple[int, int], PublisherNumbers] = {}
         # until when (trace's clock) each message waits, and its info from the middleware
         self._waiting: list[tuple[int, Work, dict[str, Any]]] = []
+        # when they were checked last, and whether they will be
         self._checked_at = 0
+        self._checks_later = False
         # the name of the job that ends because another process says so
         self._heard: tuple[int, int] | None = None
         digest = hashlib.sha256(task_set.text.encode()).hexdigest()[:8]
@@ -296,11 +298,12 @@ class Announcements:
         if origin is not None:
             self._give(work, origin)
             return
-        if not self._waiting:
+        if not self._checks_later:
             self._check_later()
         self._waiting.append((now + WAIT_NS, work, info))
 
     def _check_later(self) -> None:
+        self._checks_later = True
         self._pool.due.call_at(
             time.monotonic_ns() + WAIT_NS // 2, lambda: self._pool.report(self._check))
 
@@ -308,6 +311,7 @@ class Announcements:
         """Pass on messages that have waited for too long (rule 3)."""
         late = [entry for entry in self._waiting if entry[0] <= self._checked_at]
         self._checked_at = now
+        self._checks_later = False
         for entry in late:
             self._waiting.remove(entry)
             self._give(entry[1], self._find(entry[1], entry[2], counted=True))

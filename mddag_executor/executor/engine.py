@@ -820,7 +820,9 @@ class Engine:
 
     def hear_silent(self, job: Announced, topic: str, now: int) -> None:
         """Leave out of a job what an execution in another process has not started."""
-        if self._finished or not self.optional_topics.is_heard(job.dag, job.vertex, topic):
+        others = self.other_processes
+        if self._finished or others is None or not others.is_here(job.dag) or (
+                not self.optional_topics.is_heard(job.dag, job.vertex, topic)):
             return
         origin = self._enter(job, min(job.release, now), now)
         if origin is not None and self.open_release(origin) is not None:

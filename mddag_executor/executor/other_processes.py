@@ -194,13 +194,16 @@ class OtherProcesses:
         else:
             self._stamps.setdefault((origin.dag, origin.job), name)
         key = (origin.dag, name)
-        if key not in self._jobs:
+        before = self._jobs.get(key)
+        if before is None:
             self._kept.append(key)
             if len(self._kept) > REMEMBERED:
                 gone = self._jobs.pop(self._kept.popleft(), None)
                 if gone is not None:
                     self._names.pop((gone.dag, gone.job), None)
                     self._stamps.pop((gone.dag, gone.job), None)
+        elif before.job != origin.job and self._stamps.get((before.dag, before.job)) == name:
+            self._stamps.pop((before.dag, before.job), None)  # a source repeats its stamp
         self._jobs[key] = origin
 
     def enter(

@@ -20,13 +20,14 @@ from mddag_executor.executor.attribution import (
 )
 from mddag_executor.executor.silences import _ENTRY as _SILENCE
 from mddag_executor.executor.silences import Silences
+from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest
 from std_msgs.msg import Header, UInt8MultiArray
 
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import Declared, graph
-from .inside import pool_of
+from .inside import engine_of, pool_of, registry_of
 
 MS = 1_000_000
 
@@ -170,6 +171,22 @@ def test_messages_without_a_stamp_for_a_second_time_and_of_the_future(make_execu
         assert abs(job.release_ns - before) < 1000 * MS
 
 
+def test_a_source_that_repeats_its_stamp_leaves_nothing_behind(make_executor, make_node):
+    """As in simulated time that stands still: only the last job has the stamp."""
+    text = CHAIN.replace('timer: 20ms', 'subscription: /echo, period: 20ms')
+    nodes = Declared(make_node, text)
+    executor = make_executor(loads(text), nodes=[nodes.nodes['sensor']])
+    echo = make_node('elsewhere').create_publisher(Header, '/echo', 50)
+    stamp = time.time_ns()
+    with Spinning(executor):
+        matched(echo)
+        for count in range(1, 6):
+            echo.publish(stamped(stamp))
+            assert wait_for(lambda count=count: len(nodes.ran['tick']) == count)
+    assert len({job.job for job in nodes.jobs('tick')}) == 5
+    assert [*engine_of(executor).other_processes._stamps.values()] == [stamp]
+
+
 # --- by announcements ----------------------------------------------------------------------------
 
 GRAPH = graph(
@@ -258,6 +275,21 @@ TWO = graph(
     two='name: two, subscription: /left, deadline: 60s')
 
 
+def test_a_silence_about_a_job_that_has_nothing_here_opens_no_job(make_executor, make_node):
+    text = SOMETIMES + """
+  - node: /clock
+    callbacks: [{name: tock, timer: 20ms, deadline: 60s, dag: other}]
+processes: {p1: [/camera, /detector], p2: [/brake], p3: [/clock]}
+"""
+    nodes = Declared(make_node, text)
+    executor = make_executor(loads(text), process='p3', nodes=[nodes.nodes['clock']])
+    executor.unmatched()    # it notices which callbacks are here
+    engine, now = engine_of(executor), time.time_ns()
+    with pool_of(executor).lock:
+        engine.hear_silent(Announced((1, 2), 0, 1, now), '/alarm', now)
+    assert executor.statistics()['dags']['main']['jobs'] == 0
+
+
 def test_jobs_that_expired_in_another_process_are_missed(make_executor, make_node):
     """A timer's release that is skipped where the timer is has no result in any process."""
     nodes = Declared(make_node, TWO, {'tick': lambda: len(nodes.ran['tick']) % 5 or time.sleep(
@@ -281,6 +313,25 @@ def test_jobs_that_expired_in_another_process_are_missed(make_executor, make_nod
     assert sink['completed'] == len(nodes.ran['two']) == n
     assert sink['expired'] == here['ends']['expired'] == here['jobs'] - n
     assert down.statistics()['deadline_missed']
+
+
+def test_messages_that_wait_for_their_announcements_are_checked_together(
+        make_executor, make_node):
+    """Even if each is announced soon, so that none waits when the next one comes."""
+    nodes = Declared(make_node, TWO)
+    executor = make_executor(
+        loads(TWO + 'processes: {p1: [/one], p2: [/two]}'), process='p2',
+        nodes=[nodes.nodes['two']])
+    executor.unmatched()    # it notices which callbacks are here
+    entity, = (each for each in registry_of(executor).by_id.values() if each.awaits)
+    announcements, pool = executor._announcements, pool_of(executor)
+    before = pool.agenda._appointments
+    for _ in range(5):
+        with pool.lock:
+            announcements.receive(
+                Work(entity, print), {'source_timestamp': time.time_ns()}, pool.tick())
+            announcements._waiting.clear()
+    assert pool.agenda._appointments == before + 1
 
 
 def test_a_message_that_is_lost_on_its_way_to_another_process_is_missed(make_executor, make_node):
