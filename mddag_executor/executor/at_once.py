@@ -28,7 +28,10 @@ from mddag_executor.executor.workers import WorkerPool
 
 class AtOnce:
     """
-    The sources handled at once; all methods but ``ring`` belong to the spinning thread.
+    The sources handled at once.
+
+    All methods belong to the spinning thread, except for ``ring`` and ``handled``: a thread that
+    has sent a response takes it itself (``sent_requests``).
 
     :ivar has_run: whether the last ``handle`` has handled anything.
     """
@@ -67,7 +70,7 @@ class AtOnce:
                     self.count(work.entity)
                 else:  # it had no callback at first, and is not that of a Rate
                     self.pool.post([work])
-        due = self.agenda.first()
+        due = self.agenda.next  # not ``first``, which needs the lock
         if due != self.loop.timer.at:
             self.loop.timer.arm(due)
         return self.has_run

@@ -13,6 +13,11 @@ def engine_of(executor):
     return executor._engine
 
 
+def at_once_of(executor):
+    """Return what its spinning thread handles itself: see ``at_once.AtOnce``."""
+    return executor._at_once
+
+
 def registry_of(executor):
     """Return the entities that it knows: see ``registry.Registry``."""
     return executor._registry

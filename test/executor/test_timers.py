@@ -30,7 +30,7 @@ from std_msgs.msg import Header
 from ..conftest import examples
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import graph
-from .inside import engine_of, pool_of, registry_of
+from .inside import at_once_of, engine_of, pool_of, registry_of
 
 MS = 1_000_000
 
@@ -423,6 +423,18 @@ def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_n
         assert wait_for(lambda: got and node.get_clock().now().nanoseconds == 7_000 * MS)
         assert registry_of(executor).by_id[id(own)].name == '/node:on_clock'
         assert wait_for(lambda: executor.statistics()['callbacks']['/node:on_clock']['ran'] == 1)
+
+
+def test_the_spinning_thread_changes_its_agenda_under_the_lock_only(make_executor):
+    """Another thread may set a timer just then, which must not be lost."""
+    executor = make_executor()
+    agenda, timer = at_once_of(executor).agenda, SimpleNamespace(entry=None)
+    at = time.monotonic_ns() + 10 ** 12
+    with pool_of(executor).lock:
+        agenda.set(timer, at, at)
+        agenda.cancel(timer)
+    at_once_of(executor).handle([])
+    assert len(agenda._heap) == 1
 
 
 def test_a_step_of_the_system_clock_is_noticed(make_executor, make_node, tmp_path, monkeypatch):
