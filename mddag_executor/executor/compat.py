@@ -8,7 +8,8 @@ checks that. Each entry lists the versions in which it was seen. *7.1* is Jazzy:
 in the package index, to 7.1.11. *9.1* is Kilted: 9.1.2. Entries without a version are in both, and
 the executor needs them.
 
-Two adapters are separate modules: ``listeners`` (``handle.pointer``) and ``waitsets``.
+Adapters to rcl and rmw, which use the ``pointer`` of a handle, are separate modules:
+``listeners``, ``request_ids`` and ``waitsets``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from functools import partial
 import inspect
 from operator import attrgetter
+import os
 import sys
 import threading
 import types
@@ -487,6 +489,11 @@ def requested_service(future: Any) -> str:
 
 
 # --- executors and nodes -------------------------------------------------------------------------
+
+def distribution() -> str:
+    """Return the name of the ROS distribution: that of the environment, or else of this rclpy."""
+    return os.environ.get('ROS_DISTRO') or ('jazzy' if TimerInfo is None else 'kilted')
+
 
 TASKS_NEWEST_FIRST = TimerInfo is None and not HAS_NEXT_SPIN
 """Whether waiting tasks run in reverse order: in 7.1 before 7.1.9."""

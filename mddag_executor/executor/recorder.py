@@ -15,6 +15,7 @@ from mddag_executor import defaults
 from mddag_executor.clocks import boot, TraceClock
 from mddag_executor.core.tables import ON_LATE
 from mddag_executor.executor.attribution import PublisherState
+from mddag_executor.executor.compat import distribution
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.publishing import state_of
 from mddag_executor.trace.errors import TraceError
@@ -60,7 +61,7 @@ class Recorder:
             'task_set', task_set.text if task_set else '', task_set.file if task_set else '',
             policy, workers, default_deadline, max_active_jobs, False,
             defaults.processors() if cpus is None else cpus, ON_LATE[on_late])
-        self._say('caret_init', clock.offset_ns, 'jazzy')
+        self._say('caret_init', clock.offset_ns, distribution())
         self._say('host', socket.gethostname(), boot())
         self._say('rmw_implementation', get_rmw_implementation_identifier())
         self._say('construct_executor', id(self), 'multi_deadline_executor')

@@ -19,6 +19,7 @@ from mddag_executor.executor.stamps import StampedReleases
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
+import rclpy.timer
 from rclpy.duration import Duration
 from rclpy.task import Future
 from rclpy.time import Time
@@ -119,6 +120,17 @@ def test_a_publisher_that_is_noticed_too_late_is_recorded(make_executor, make_no
     assert live['completed'] >= 10
     assert [found.get(key) for key in ('completed', 'not_due')] == [
         live.get(key) for key in ('completed', 'not_due')]
+
+
+@pytest.mark.parametrize('given', ['rolling', ''])
+def test_a_trace_names_the_distribution(make_executor, tmp_path, monkeypatch, given):
+    """That of the environment; without one it is known by rclpy."""
+    path = tmp_path / 'live.mcap'
+    monkeypatch.setenv('ROS_DISTRO', given)
+    make_executor(trace=path).shutdown()
+    begun, = read_events(path, ['ros2_caret:caret_init'])
+    usual = 'kilted' if hasattr(rclpy.timer, 'TimerInfo') else 'jazzy'
+    assert begun['distribution'] == (given or usual)
 
 
 def test_an_undeclared_coroutine_is_one_execution_however_often_it_is_resumed(
