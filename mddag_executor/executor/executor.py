@@ -128,6 +128,8 @@ class MultiDeadlineExecutor(BareExecutor):
         (``unreported_misses`` in ``statistics()``).
     :param default_deadline: relative deadline of undeclared callbacks: ns, text such as ``100ms``,
         or an rclpy ``Duration``.
+    :param max_active_jobs: how many jobs of a DAG that declares no number itself may be open at a
+        time; the oldest one expires when another one is released.
     :param worker_policy: real-time policy of the workers, ``SCHED_FIFO`` or ``SCHED_RR``.
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
@@ -393,8 +395,8 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         Call a function after each callback, and each piece of a coroutine, in its thread.
 
-        It is also called, in the spinning thread, after a response that is handled at once
-        (``at_once``).
+        It is also called after a response that is handled at once (``at_once``), in the thread
+        that has taken it.
 
         :param listener: receives rclpy's entity (None: a task), the exception of its callback, or
             None, and the number of the outer group in which it ran, or -1; returns whether it

@@ -159,7 +159,9 @@ class Statistics(ExecutorState):
     callbacks: dict[str, CallbackCounts]
     """By name the callbacks, declared ones and others."""
     unreported_misses: int
-    """Misses that `on_deadline_miss` was not called for, because 256 already waited."""
+    """
+    Misses that `on_deadline_miss` was not called for: 256 waited already, or the run had ended.
+    """
     trace: TraceState | None
     """The trace; null if the run was not recorded."""
 
@@ -294,8 +296,6 @@ class RunProcess(TypedDict):
     """The last line of its standard error, if it died; else null."""
     trace: TraceState | None
     """Its trace; null if it has none."""
-
-
 
 
 class RunOfProcessesResult(Program, ExecutorState):
