@@ -19,10 +19,10 @@ from mddag_executor.executor.stamps import StampedReleases
 from mddag_executor.trace import read_events
 from msg_graph import loads
 import pytest
-import rclpy.timer
 from rclpy.duration import Duration
 from rclpy.task import Future
 from rclpy.time import Time
+import rclpy.timer
 from std_msgs.msg import Header
 from std_srvs.srv import Empty
 
