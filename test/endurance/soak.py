@@ -26,7 +26,7 @@ deadline for waits (``unjudged_sinks`` in the result: no policy keeps these), an
 the machine stood still: another process, which only sleeps, was woken more than ``STALL_S`` late,
 or the host of a virtual machine took ``STOLEN_S`` or more from its CPUs (*steal* in
 ``/proc/stat``).  With ``--trace``, ``clean_causes`` in the result counts what ``mddag explain``
-says of the misses in clean windows, and those by the *machine* are no failure.
+says of the misses in clean windows, and one by the *machine* is not a failure.
 """
 
 import argparse

@@ -425,7 +425,7 @@ def test_a_timer_runs_as_often_as_its_group_lets_it(make_executor, make_node):
 
 
 def test_a_group_that_has_refused_often_is_asked_again_once_at_a_time(make_executor, make_node):
-    """Not once for each refusal: each of these would lead to a further one."""
+    """Not once for each time that it has refused: each would lead to a further one."""
     node, group, calls = make_node(), Tokens(), []
     node.create_timer(0.001, lambda: None, callback_group=group)
     executor = make_executor(num_workers=1, nodes=[node])

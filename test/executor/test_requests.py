@@ -268,7 +268,7 @@ def test_requests_are_forgotten(make_executor, make_node):
 
 def test_a_request_to_another_executor_is_forgotten_with_its_response(make_executor, make_node):
     async def ask(each):
-        for _ in range(3):
+        for _ in range(30):
             await each.request('elsewhere')
 
     each = Asking(make_executor, make_node, ask)
@@ -277,7 +277,8 @@ def test_a_request_to_another_executor_is_forgotten_with_its_response(make_execu
     each.clients['elsewhere'] = each.node.create_client(Trigger, '/elsewhere')
     with Spinning(make_executor(None, nodes=[elsewhere])):
         each.run()
-    assert engine_of(each.executor).sent_requests.is_empty()
+    # one whose response comes before it is noted remains until there are many
+    assert len(engine_of(each.executor).sent_requests._notes) < 20
 
 
 def test_a_request_that_is_taken_before_it_is_noted_is_forgotten_with_its_response():
