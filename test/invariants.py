@@ -295,5 +295,5 @@ def _executions(engine):
         yield f'executions {holding} hold the GIL, noted are {[w.x for w in holders]}'
         return
     keys = [state.x_key[work.x][0] for work in holders]
-    if any(after >= before for before, after in zip(keys, keys[1:])):
+    if any(after > before for before, after in zip(keys, keys[1:])):
         yield f'the GIL was overtaken by something that is not more urgent: {keys}'

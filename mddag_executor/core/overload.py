@@ -54,6 +54,8 @@ def demote(t: Tables, s: State, heap: list[QueueEntry], x: int, now: int) -> boo
         priority = _priority_in_time(t, s, x, now)
         if priority == NEVER:
             priority = _late_priority(t, s, x, now)
+        if entry[4] < 0:
+            priority = min(priority, s.x_urged[x])
     if priority == NEVER or priority <= entry[0]:
         return False
     heappop(heap)

@@ -86,9 +86,20 @@ def enqueue(t: Tables, s: State, x: int) -> None:
 def wait_alone(s: State, x: int) -> None:
     """Let an execution wait with an entry of its own, not in a queue."""
     key = s.x_key[x]
-    s.x_key[x] = (key[0], key[1], key[2], key[3], ~x)
+    s.x_key[x] = (min(key[0], s.x_urged[x]), key[1], key[2], key[3], ~x)
     s.x_state[x] = ALONE
     heappush(s.ready, s.x_key[x])
+
+
+def urge(s: State, x: int, priority: int) -> None:
+    """Let the owner of a callback group have the priority of one that waits for it (rule 4)."""
+    key = s.x_key[x]
+    s.x_urged[x] = priority
+    if s.x_state[x] == ALONE:
+        unlink(s, x)
+        wait_alone(s, x)
+    else:
+        s.x_key[x] = (priority, key[1], key[2], key[3], key[4])
 
 
 def _link(s: State, queue: int, before: int, after: int) -> None:

@@ -34,8 +34,10 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
 4.  **Callback groups.**  A group has at most one owner, from its first dispatch to its completion,
     including the time in which it is preempted or suspended.  If a queue comes first while the
     group of its first execution is busy, its entry is set aside in the heap of the group.  When
-    the owner completes, the smallest entry of the group returns.  A group of a user's own class
-    lets executions run one by one.  If the owner may begin, it leaves the group for ever
+    the owner completes, the smallest entry of the group returns.  Until then the owner is *urged*:
+    it has at most the priority of each execution that was set aside, and was not late then
+    (``urge``).  Otherwise all that is more urgent than the owner would hold up what waits for it.
+    A group of a user's own class lets executions run one by one.  If the owner may begin, it leaves the group for ever
     (``leave_group``).  If it may not, it waits as the owner, so that no other execution overtakes
     it (``refuse``, then ``ask_again``).
     In a live run, callbacks of one of a program's executors belong to an *outer group*.  At most a
@@ -69,7 +71,7 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     would put it off again and again.
     Age and place belong to the queue: if an execution is dropped (rule 11, or live a full queue),
     the queue keeps the place and the lateness of the dropped execution.  A preempted execution
-    is checked by itself.  Running executions keep their keys.  Only policies whose keys are times
+    is checked by itself.  Running executions keep their keys, unless they are urged (rule 4). Only policies whose keys are times
     demote.
     It is not known how long undeclared callbacks take.  Their queue is late when its first
     execution is past its deadline, and remains late until it is empty.  So an overload of
@@ -160,6 +162,7 @@ from mddag_executor.core.queues import (
     next_heap,
     put,
     unlink,
+    urge,
     wait_alone,
     wait_for_outer,
 )
@@ -192,7 +195,7 @@ from mddag_executor.core.state import (
     SUSPENDED,
     WAITING,
 )
-from mddag_executor.core.tables import AFTER_DRIVEN, DRIVEN, KEEP_ALL, KEEP_NEWEST, Tables
+from mddag_executor.core.tables import AFTER_DRIVEN, DRIVEN, KEEP_ALL, KEEP_NEWEST, NEVER, Tables
 
 
 def make_ready(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> None:
@@ -299,6 +302,7 @@ def drop(t: Tables, s: State, x: int, now: int) -> None:
     dag = s.job_dag[slot]
     s.decisions.append((DROP, dag, s.x_vertex[x], s.job_index[slot], x, now))
     group = s.x_group[x]
+    s.x_urged[x] = NEVER
     if group >= 0 and (s.group_owner[group] == -1 or s.group_owner[group] == x):
         _free_group(s, group)  # its entry may have been its group's in the ready heap
     _count_wait(s, x, now)
@@ -329,7 +333,7 @@ def peek(t: Tables, s: State, now: int) -> int:
         group = s.x_group[x]
         if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
             heappop(heap)
-            _wait_for_group(s, entry, group)
+            _wait_for_group(t, s, entry, x, now)
             _let_others(s, x)
         elif s.outer_limit and not has_place(s, x):
             heappop(heap)
@@ -351,11 +355,16 @@ def peek(t: Tables, s: State, now: int) -> int:
     return -1
 
 
-def _wait_for_group(s: State, entry: QueueEntry, group: int) -> None:
-    """Set an entry aside until its group is free (rule 4)."""
+def _wait_for_group(t: Tables, s: State, entry: QueueEntry, x: int, now: int) -> None:
+    """Set the entry of an execution aside until its group is free, and urge the owner (rule 4)."""
+    group = s.x_group[x]
     if entry[4] >= 0:
         s.queue_place[entry[4]] = group
     heappush(s.group_heap[group], entry)
+    owner = s.group_owner[group]
+    if entry[0] < s.x_key[owner][0] and (
+            now <= s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]):
+        urge(s, owner, entry[0])
 
 
 def let_group(s: State, x: int) -> None:
@@ -466,6 +475,7 @@ def leave_group(s: State, x: int) -> None:
     """Let a running execution go on without its group, which becomes free (rule 4)."""
     group = s.x_group[x]
     s.x_group[x] = -1
+    s.x_urged[x] = NEVER
     _free_group(s, group)
 
 
@@ -535,6 +545,7 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
     group = s.x_group[x]
     if group >= 0 and s.group_owner[group] == x:
         s.group_owner[group] = -1
+        s.x_urged[x] = NEVER
         if s.group_heap[group]:
             _free_group(s, group)
     vertex = s.x_vertex[x]

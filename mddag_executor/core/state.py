@@ -159,6 +159,8 @@ class State(NamedTuple):
     x_holds: list[int]
     x_worker: list[int]
     x_key: list[QueueEntry]
+    # the least priority of what waits for its callback group, or NEVER
+    x_urged: list[int]
     x_started: list[int]
     x_left: list[int]
     x_cost: list[int]
@@ -275,6 +277,7 @@ def add_slot(t: Tables, s: State, dag: int) -> None:
             s.x_previous.append(-1)
             s.x_holds.append(0)
             s.x_key.append((0, 0, 0, 0, 0))
+            s.x_urged.append(NEVER)
             s.x_state.append(IDLE)
             s.x_pending.append(0)
             s.x_worker.append(-1)

@@ -33,7 +33,7 @@ that times never decrease.  The engine and ``other_processes`` change the core's
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from threading import get_native_id
 from typing import Any, Protocol, TYPE_CHECKING
 
@@ -102,9 +102,9 @@ class Step:
 
     :ivar work: the execution to run; None: there is none.
     :ivar is_short: whether it usually ends soon; this and what follows only if there is one:
-    :ivar overtaken: the execution that is to pause while it runs; None: none.
     :ivar patience_ns: how long what waits, or may come, may wait for a short execution to end.
-    :ivar more: whether another thread may start an execution now; this and what follows always:
+    :ivar overtaken: the executions that are to pause; this and what follows always:
+    :ivar more: whether another thread may start an execution now.
     :ivar n_idle: how many workers run nothing.
     """
 
@@ -112,7 +112,7 @@ class Step:
 
     def __init__(self) -> None:
         self.work: Work | None = None
-        self.overtaken: Work | None = None
+        self.overtaken: Sequence[Work] = ()
         self.is_short = self.more = False
         self.n_idle = 0
         self.patience_ns = NET_NS
@@ -521,6 +521,7 @@ class Engine:
         step, bypass = self._step, self._bypass
         if not (self._ready or self._deferred or bypass.queue):  # nearly every second time
             step.work = None
+            step.overtaken = ()
             step.more = False
             step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
             return step
@@ -529,9 +530,11 @@ class Engine:
         is_short = False
         if work is not None:
             is_short = step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
-            holders = self._holders
-            step.overtaken = holders[-2] if (
-                len(holders) > 1 and holders[-1] is work and self.interpreter.pauses) else None
+        step.overtaken = ()
+        if len(self._holders) > 1:
+            self.interpreter.reorder()
+            if self.interpreter.pauses:
+                step.overtaken = self.interpreter.overtaken
         if self._ready or self._deferred or bypass.queue:
             step.patience_ns = self.interpreter.patience()
             step.more = (others_wait or not is_short) and self._may_start_more(now)
@@ -544,6 +547,7 @@ class Engine:
         """Return what other threads are to do, after all events up to now."""
         step = self._step
         step.work = None
+        step.overtaken = ()
         step.n_idle = self.idle_workers
         step.more = self.has_waiting and self._may_start_more(now)
         return step

@@ -4,7 +4,8 @@
 Who holds the interpreter (the GIL), and when what waits may overtake it (``core.rules``, rule 10).
 
 Executions that hold it form a chain: each one overtook the one before, and only the latest
-computes.  All times are ns on the trace's clock.
+computes.  If an overtaken one is urged (``core.rules``, rule 4), it may overtake the later ones.
+All times are ns on the trace's clock.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Interpreter:
     """
     The executions that hold the interpreter, and what waits for it; changed by the engine only.
 
-    :ivar holders: those that hold it, in the order in which they began.
+    :ivar holders: those that hold it, the most urgent one last.
     :ivar pauses: whether a callback pauses while a more urgent one overtakes it.
     """
 
@@ -51,13 +52,18 @@ class Interpreter:
 
     @property
     def holder(self) -> Work | None:
-        """Return the most urgent execution that holds it: the latest to overtake."""
+        """Return the most urgent execution that holds it."""
         return self.holders[-1] if self.holders else None
 
     @property
     def overtaken(self) -> list[Work]:
         """Return the executions that hold it but were overtaken."""
         return self.holders[:-1]
+
+    def reorder(self) -> None:
+        """Put those that hold it into the order of their urgency, which may have changed."""
+        keys = self._state.x_key
+        self.holders.sort(key=lambda work: -keys[work.x][0])
 
     def is_wanted(self) -> bool:
         """Return whether anything waits while an execution holds it."""

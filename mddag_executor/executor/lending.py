@@ -176,7 +176,7 @@ class Lending:
         pool.become(thread, ThreadState.RUNNING)
         thread.worker = work.worker
         self.is_back(thread)
-        if step.overtaken is not None:
+        if step.overtaken:
             pool.pauses.begin(step.overtaken, thread)
         thread.permit.release()
         pool.due.check.begin_if_wanted(pool.now - pool.offset)

@@ -24,7 +24,7 @@ tools use all of its identifiers, the two share the GIL.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import os
 import sys
 import sysconfig
@@ -76,12 +76,19 @@ class Pauses:
         self._pool = pool
         self.paused: dict[Any, Pause] = {}
 
-    def begin(self, overtaken: Any, me: Any) -> None:
-        """Let the callback pause that the execution of a thread overtakes."""
-        thread = self._pool.thread_of(overtaken)
-        if thread is not None and overtaken not in self.paused:
-            me.pause = self.paused[overtaken] = Pause(thread)
-        # else the last one that overtook it has just ended
+    def begin(self, overtaken: Sequence[Any], me: Any) -> None:
+        """
+        Let the callbacks pause that are overtaken, and those continue that are not any more.
+
+        :param me: the thread whose execution overtakes them; None: a paused one was urged.
+        """
+        self.end()
+        for work in overtaken:
+            thread = None if work in self.paused else self._pool.thread_of(work)
+            if thread is not None:  # else it has just ended
+                pause = self.paused[work] = Pause(thread)
+                if me is not None:
+                    me.pause = pause
 
     def end(self) -> None:
         """Let those executions continue that are no longer overtaken."""

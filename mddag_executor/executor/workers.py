@@ -650,6 +650,8 @@ class WorkerPool:
         else:
             step = self.engine.advice(now)
         work = step.work
+        if step.overtaken:
+            self.pauses.begin(step.overtaken, None if work is None else me)
         if work is None:
             self._rest(me, step, now)
             return False
@@ -657,8 +659,6 @@ class WorkerPool:
         me.worker = work.worker
         if me.state is not _RUNNING:
             self.become(me, _RUNNING)
-        if step.overtaken is not None:
-            self.pauses.begin(step.overtaken, me)
         if step.is_short and not self.polling and not self.is_spin_once:  # nearly always
             me.is_spare = False
             if step.n_idle:

@@ -29,6 +29,8 @@ Its reading of the documents:
   released eight relative deadlines later, until one of its executions runs; so are the later
   vertices of that job.  Once a head was late, the queue has no later place than that until one of
   its executions runs, even if others can be in time.  A preempted execution is a queue by itself.
+* Suppose that an execution would start next, but another one of its group has begun and not ended.
+  If the first one is not late for any deadline, the other one has its priority until it ends.
 * ``keep: newest`` at a source or sink: of two executions in a queue, the one of the earlier job is
   dropped.  With ``demote``, an execution of a timer that can make none of the deadlines that it
   leads to is dropped when a later one becomes ready.  If a late execution is dropped, its queue
@@ -109,6 +111,7 @@ class Execution:
     arrival: int
     has_run: bool = False
     lowered: int | None = None  # its priority, if it was preempted and then demoted
+    urged: int | None = None  # the least priority of what waits for its group
     running_as: int = 0  # the priority with which it was started
 
 
@@ -181,10 +184,11 @@ class BruteForce:
 
     def priority(self, execution):
         """Return what decides about preemption."""
-        if execution.lowered is not None:
-            return execution.lowered
-        return self._priority(
-            execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
+        own = execution.lowered
+        if own is None:
+            own = self._priority(
+                execution, {*self.laxity[execution.job.dag.index, execution.vertex.index]})
+        return own if execution.urged is None else min(own, execution.urged)
 
     def _queue(self, key):
         """Return what waits at a vertex of a DAG and has never run, the head first."""
@@ -217,6 +221,8 @@ class BruteForce:
             lowest = self._late_priority(execution, not execution.has_run)
         elif not execution.has_run and (ahead > 0 or self._at(execution) in self.demoted):
             lowest = min(lowest, self._aged_priority(execution))
+        if execution.urged is not None:
+            lowest = min(lowest, execution.urged)
         place = self._place_of(execution)
         if lowest <= place[0]:
             return False
@@ -436,24 +442,40 @@ class BruteForce:
 
     # --- workers ---------------------------------------------------------------------------------
 
-    def _blocked(self, execution):
-        """Tell whether another execution that has begun and not ended holds the group."""
+    def _owner(self, execution):
+        """Return another execution that has begun and not ended, and holds the group."""
         callback = execution.vertex.callback
         if callback.group is None:
-            return False
+            return None
         begun = [e for e in self.running if e is not None]
         begun += [e for e in self.waiting if e.has_run]
-        return any(
-            e is not execution and (e.vertex.callback.node, e.vertex.callback.group)
-            == (callback.node, callback.group) for e in begun)
+        return next((
+            e for e in begun
+            if e is not execution and (e.vertex.callback.node, e.vertex.callback.group)
+            == (callback.node, callback.group)), None)
+
+    def _first_able(self):
+        """Return what comes first and may start; those before it urge the owners of their group."""
+        for each in sorted(self._heads(), key=self._place_of):
+            owner = self._owner(each)
+            if owner is None:
+                return each
+            place = self._place_of(each)[0]
+            if self._demotes(each.job.dag) and self._late_sinks(each, 0):
+                continue
+            if owner in self.running and place < owner.running_as:
+                owner.urged = owner.running_as = place
+            elif owner not in self.running and place < self.priority(owner):
+                owner.urged = place
+                return self._first_able()
+        return None
 
     def _hand_out(self):
         """Hand out one execution; False when that is not possible."""
         if self.policy == 'ros2':
             best = self._next_of_round()
         else:
-            able = [e for e in self._heads() if not self._blocked(e)]
-            best = min(able, key=self._place_of) if able else None
+            best = self._first_able()
         if best is None:
             return False
         if self._demote(best):
@@ -495,7 +517,7 @@ class BruteForce:
                 key = min(self.round, key=self.places.get)
                 self.round.remove(key)
                 head = self._queue(key)[0]
-                if not self._blocked(head):
+                if self._owner(head) is None:
                     return head
         return None
 

@@ -489,16 +489,45 @@ def test_a_step_says_what_is_overtaken_and_when_the_next_deadline_is():
     engine.ready(Work(long, print), 0)
     step = engine.step(0, 0)
     held = step.work
-    assert step.overtaken is None and engine.next_deadline() == NEVER
+    assert not step.overtaken and engine.next_deadline() == NEVER
     engine.timer_due(Work(urgent, print), MS, MS)
     step = engine.step(1, MS)
     work = step.work
-    assert work.entity is urgent and step.overtaken is held
+    assert work.entity is urgent and step.overtaken == [held]
     assert engine.next_deadline() == 11 * MS and engine.interpreter.overtaken == [held]
     engine.finished(work, MS, 2 * MS, 2 * MS, 0, 1)
     step = engine.step(1, 2 * MS)
     assert step.work is None and engine.interpreter.holders == [held]
     assert engine.next_deadline() == NEVER
+
+
+@pytest.mark.parametrize('is_late', [False, True])
+def test_what_waits_for_a_callback_group_urges_its_owner(is_late):
+    """Else an overtaken callback pauses for all that are less urgent than what it holds up."""
+    task_set = loads(graph(
+        n='name: fast, timer: 20ms, deadline: 20ms\nname: slow, timer: 500ms, deadline: 500ms',
+        m='name: between, timer: 100ms, deadline: 100ms'))
+    engine = new_engine(task_set, 3)
+    engine.interpreter.pauses = True
+    group = engine.scheduler.new_group()
+    fast, slow, between = (entity_of(engine, task_set, dag, 0) for dag in range(3))
+    fast.group = slow.group = group
+    works = []
+    for entity, now in ((slow, 0), (between, MS), (fast, 2 * MS)):
+        entity.habit = GilHabit(True)
+        entity.habit.mean_ns = 10 ** 9
+        release = now - 30 * MS if is_late and entity is fast else now
+        entity.since = release
+        works.append(Work(entity, print))
+        engine.timer_due(works[-1], release, now)
+        step = engine.step(len(works) - 1, now)
+        check(engine)
+    assert step.work is None
+    chain = works[:2] if is_late else works[1::-1]
+    assert engine.interpreter.holders == chain and step.overtaken == chain[:1]
+    engine.finished(works[0], 0, 3 * MS, 3 * MS, 0, 0)
+    assert engine.step(0, 3 * MS).work is (None if is_late else works[2])
+    check(engine)
 
 
 @examples(150)
