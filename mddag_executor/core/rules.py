@@ -37,9 +37,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     the owner completes, the smallest entry of the group returns.  Until then the owner is *urged*:
     it has at most the priority of each execution that was set aside, and was not late then
     (``urge``).  Otherwise all that is more urgent than the owner would hold up what waits for it.
-    A group of a user's own class lets executions run one by one.  If the owner may begin, it leaves the group for ever
-    (``leave_group``).  If it may not, it waits as the owner, so that no other execution overtakes
-    it (``refuse``, then ``ask_again``).
+    A group of a user's own class lets executions run one by one.  If the owner may begin, it
+    leaves the group for ever (``leave_group``).  If it may not, it waits as the owner, so that no
+    other execution overtakes it (``refuse``, then ``ask_again``).
     In a live run, callbacks of one of a program's executors belong to an *outer group*.  At most a
     given number of them may run at a time, or none while the outer group is closed
     (``open_outer``).  If a queue comes first while its outer group has no place, its entry is set
@@ -71,8 +71,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     would put it off again and again.
     Age and place belong to the queue: if an execution is dropped (rule 11, or live a full queue),
     the queue keeps the place and the lateness of the dropped execution.  A preempted execution
-    is checked by itself.  Running executions keep their keys, unless they are urged (rule 4). Only policies whose keys are times
-    demote.
+    is checked by itself.  Running executions keep their keys, unless they are urged (rule 4).
+    Only policies whose keys are times demote.
     It is not known how long undeclared callbacks take.  Their queue is late when its first
     execution is past its deadline, and remains late until it is empty.  So an overload of
     undeclared callbacks never makes a declared deadline miss for long, and each of them gets its

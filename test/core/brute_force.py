@@ -455,7 +455,7 @@ class BruteForce:
             == (callback.node, callback.group)), None)
 
     def _first_able(self):
-        """Return what comes first and may start; those before it urge the owners of their group."""
+        """Return what may start first; those before it urge the owners of their groups."""
         for each in sorted(self._heads(), key=self._place_of):
             owner = self._owner(each)
             if owner is None:
