@@ -177,12 +177,15 @@ class MixedRun(UndeclaredRun):
                 imported[1].path, f'it is an imported recording, as {imported[0].path} is',
                 "import all sessions of the run into one: 'mddag import ctf SESSION… -o OUT.mcap'")
         self._parts.sort(key=lambda part: part.is_own)
+        self._apart: ReplayError | None = None
         self._twice: list[str] = []
         self._unknown_clocks: list[str] = []
         self._workers_of: dict[int, int] = {}
         self._failed: Ints = np.empty(0, dtype=np.int64)
         super().__init__(
             self._parts[0].reader, ', '.join(paths), self._judge(task_set), None, progress)
+        if self._apart is not None and not self._crossed.any():
+            raise self._apart
         default = {part.head.default_deadline for part in self._parts if part.head is not None}
         self.head = self.head._replace(default_deadline=max(default, default=0))
 
@@ -217,18 +220,26 @@ class MixedRun(UndeclaredRun):
         return self._joined(several)
 
     def _check_run(self, several: Sequence[Events]) -> None:
-        """Refuse recordings of several runs: no recording goes on from one to the other."""
+        """
+        Refuse recordings of several runs: no recording goes on from one to the other.
+
+        Clocks of several computers may differ by as much; then messages show that it is one run.
+        """
         times = [events.table['time'] for events in several]
         ranges = sorted((int(each[0]), int(each[-1]), part.path)
                         for each, part in zip(times, self._parts))
         last = ranges[0][1]
         for begin, end, path in ranges[1:]:
             if begin > last:
-                raise ReplayError(
+                self._apart = ReplayError(
                     path, f'it is of another run than {ranges[0][2]}: it begins '
                     f'{(begin - last) / 1e9:.3f} s after the end of the others',
-                    'give the recordings of one run, or synchronise the clocks of its computers')
+                    'give the recordings of one run')
             last = max(last, end)
+        boots = {each.boot for part, events in zip(self._parts, several)
+                 for each in part.clocks(events).values()}
+        if self._apart is not None and ('' in boots or len(boots) < 2):
+            raise self._apart
 
     def _once(self, several: list[Events]) -> list[Events]:
         """Leave out what is recorded twice (rule 3)."""
@@ -399,15 +410,23 @@ class MixedRun(UndeclaredRun):
                 f'{self.name}: {topic} is not joined: {counted(received, "execution")} for '
                 f'messages that {sent}'))
 
+    @property
+    def _crossed(self) -> Mask:
+        """Return which executions were started by a message of the other recording."""
+        links = self.links
+        sender = links.is_own[self._events.table['thread'][links.messages['at']]]
+        crossed: Mask = (links.runs['message'] >= 0) & (
+            np.append(sender, False)[links.runs['message']] != links.own_runs)
+        return crossed
+
     def _unjoined(self) -> Iterator[tuple[str, str, int]]:
         """Yield topics of which no message was found in the other recording, and why not."""
-        runs, messages, links = self.links.runs, self.links.messages, self.links
+        runs, messages, links, crossed = (
+            self.links.runs, self.links.messages, self.links, self._crossed)
         topics = {number: topic for topic, number in links.topics.items()}
         start = np.array([links.topics.get(each.start, -1) if each.kind == 'subscription' else -1
                           for each in links.callbacks], dtype=np.int64)[runs['callback']]
         sender = links.is_own[self._events.table['thread'][messages['at']]]
-        crossed = (runs['message'] >= 0) & (
-            np.append(sender, False)[runs['message']] != links.own_runs)
         for by_own in (False, True):
             sent = sender == by_own
             for number in distinct(links.topic_of[sent]).tolist():

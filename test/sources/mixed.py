@@ -35,10 +35,13 @@ class Own:
     The trace of a process of this executor; times are ns since `BEGIN` by LTTng's clock.
 
     :param ahead: how far its clock is ahead of LTTng's.
+    :param boot: of its computer; that of LTTng's is `boot`.
+    :param but: the place of an event that is lost.
     """
 
-    def __init__(self, path, graph='', ahead=0, pid=2, boot='boot', begin=0):
+    def __init__(self, path, graph='', ahead=0, pid=2, boot='boot', begin=0, but=-1):
         self.path, self.ahead, self.pid = str(path), ahead, pid
+        self.boot, self.but, self.names = boot, but, []
         self.file = TraceFile(self.path, overwrite=True)
         self.add('task_set', begin, graph, 'own.yaml' if graph else '', 'rad', 2, 100 * MS, 64,
                  False, 2, 0)
@@ -50,7 +53,9 @@ class Own:
         return BEGIN + time + self.ahead
 
     def add(self, name, time, *fields, tid=7):
-        self.file.add(name, self.at(time), self.pid, tid, *fields)
+        if len(self.names) != self.but:
+            self.file.add(name, self.at(time), self.pid, tid, *fields)
+        self.names.append(name)
 
     def node(self, name):
         namespace, _, short = name.rpartition('/')
@@ -65,8 +70,9 @@ class Own:
         self.add('rclcpp_subscription_callback_added', self.begin, callback + 10, callback)
 
     def take(self, callback, time, stamp, number=0):
-        """Take a message; its source timestamp is by the clock of the system, as this one's."""
-        self.add('rmw_take', time, callback + 10, 0, self.at(stamp), True, number)
+        """Take a message of LTTng's computer; the system clock of that has its stamp."""
+        self.add('rmw_take', time, callback + 10, 0,
+                 self.at(stamp) if self.boot == 'boot' else BEGIN + stamp, True, number)
 
     def run(self, callback, ready, start, end, tid=7, declared=False, fails=False):
         ids = (0, 0, self.job) if declared else (-1, -1, -1)
@@ -94,6 +100,11 @@ class Own:
 
 def detector(path, n=N, declared=False, fails=(), end=(N + 1) * 100 * MS, first=1, **more):
     """Write the trace of /detect, which publishes boxes 9 ms after the camera's timer was due."""
+    return detecting(path, n, declared, fails, first, **more).end(end)
+
+
+def detecting(path, n=N, declared=False, fails=(), first=1, **more):
+    """Return the trace of /detect without its end."""
     own = Own(path, OWN_GRAPH if declared else '', **more)
     own.node('/detect')
     own.publisher(BOXES, '/boxes')
@@ -104,11 +115,17 @@ def detector(path, n=N, declared=False, fails=(), end=(N + 1) * 100 * MS, first=
         own.publish(BOXES, at + 9 * MS)
         own.run(DETECT, at + 3500 * US, at + 4 * MS, at + 10 * MS, declared=declared,
                 fails=k in fails)
-    return own.end(end)
+    return own
 
 
-def robot(path, ahead=0, n=N, boot='boot', offset=OFFSET, style='tracing', until=N):
-    """Return what LTTng recorded of /camera and /plan, up to some job; not written yet."""
+def robot(path, ahead=0, n=N, boot='boot', offset=OFFSET, style='tracing', until=N, taken='take',
+          other=0):
+    """
+    Return what LTTng recorded of /camera and /plan, up to some job; not written yet.
+
+    :param style: of ``Recorded.publish``; ``taken``: of ``receive``.
+    :param other: how far the clock of the executor's computer is ahead, if it is another one.
+    """
     r = Recorded(path)
     r.add('mddag:host', 0, 1, 'robot', boot, offset)
     r.add('mddag:process', 0, 1, 'robot')
@@ -122,5 +139,6 @@ def robot(path, ahead=0, n=N, boot='boot', offset=OFFSET, style='tracing', until
         r.run(GRAB, 1, at + 1 * MS, at + 3 * MS)
         r.publish(IMAGE, 1, at + 2 * MS, at + 2010 * US + ahead, style=style)
         if k <= n:
-            r.receive(PLAN, 1, at + 11 * MS, at + 15 * MS, at + 9020 * US + ahead, style='take')
+            r.receive(PLAN, 1, at + 11 * MS, at + 15 * MS, at + 9020 * US + ahead + other,
+                      style=taken)
     return r

@@ -11,7 +11,7 @@ from mddag_executor.sources.open import Traces
 from msg_graph import load, loads
 import pytest
 
-from .mixed import DETECT, detector, GRAPH, N, Own, OWN_GRAPH, robot
+from .mixed import DETECT, detecting, detector, GRAPH, N, Own, OWN_GRAPH, robot
 from .recorded import MS, US
 
 PAIR = Path(__file__).parent / 'mixed_pair'
@@ -65,6 +65,45 @@ def test_jobs_go_from_one_recording_to_the_other_and_back(tmp_path, graph, ahead
         'communications']] == [
             ('/boxes', '/plan subscription /boxes', N),
             ('/image', '/detect subscription /image', N)]
+
+
+@pytest.mark.parametrize(('style', 'taken'), [
+    ('caret', 'caret'), ('humble_fastdds', 'take'), ('jazzy', 'take')])
+def test_recordings_of_caret_are_joined_as_well(tmp_path, graph, style, taken):
+    lttng = robot(tmp_path / 'lttng.mcap', 7 * MS, style=style, taken=taken).write()
+    result = replay([detector(tmp_path / 'own.mcap', ahead=7 * MS), str(lttng)], graph).result()
+    assert result['warnings'] == []
+    assert (sink(result)['completed'], sink(result)['response_ns']) == (N, same(15 * MS))
+
+
+@pytest.mark.parametrize('ahead', [5 * MS, -5 * MS, 40_000 * MS])
+def test_messages_both_ways_show_how_the_clock_of_another_computer_differs(
+        tmp_path, graph, ahead):
+    paths = [detector(tmp_path / 'own.mcap', ahead=ahead, boot='other'),
+             str(robot(tmp_path / 'lttng.mcap', other=ahead).write())]
+    result = replay(paths, graph).result()
+    # from /camera to /detect 1.5 ms at least, back 2 ms
+    line, = result['warnings']
+    assert f'the clock of /detect is taken to be {abs(ahead / MS - 0.248):.3f} ms ' in line
+    assert (sink(result)['completed'], sink(result)['response_ns']) == (N, same(15 * MS))
+
+
+def test_whatever_is_lost_no_job_is_late_or_expired(tmp_path, graph):
+    r = robot(tmp_path / 'lttng.mcap', n=3, until=4)
+    r.run(11, 1, 3000 * MS, 3001 * MS)
+    own = detector(tmp_path / 'own.mcap', n=3, end=3500 * MS)
+    whole = replay([own, str(r.write())], graph).result()['dags']['/camera']['ends']
+    assert (whole['completed'], whole['late'], whole['expired']) == (3, 0, 1)
+    names = r.names()
+    for place in range(names.index('ros2:callback_start'), len(names)):
+        ends = replay([own, str(r.write(but=[place]))], graph).result()['dags']['/camera']['ends']
+        assert (ends['late'], ends['expired']) in ((0, 0), (0, 1)), (place, names[place], ends)
+    lttng = str(r.write())
+    names = detecting(tmp_path / 'whole.mcap', n=3).names
+    for place in range(names.index('rmw_take'), len(names)):
+        cut = detecting(tmp_path / 'cut.mcap', n=3, but=place).end(3500 * MS)
+        ends = replay([cut, lttng], graph).result()['dags']['/camera']['ends']
+        assert (ends['late'], ends['expired']) in ((0, 0), (0, 1)), (place, names[place], ends)
 
 
 def test_without_graph_the_recorded_one_judges(tmp_path):
