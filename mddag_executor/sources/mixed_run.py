@@ -372,10 +372,6 @@ class MixedRun(UndeclaredRun):
                 judged.append(int(of.min()))
         return max(judged, default=-NEVER)
 
-    def _workers_each(self) -> int:
-        return max(super()._workers_each(), *(
-            part.head.workers for part in self._parts if part.head is not None))
-
     def _with_failures(self, found: Recording) -> Recording:
         """Let jobs fail with executions that raised: these complete nothing."""
         runs, columns = self.links.runs, found.columns

@@ -69,16 +69,22 @@ class Own:
         self.add('rclcpp_subscription_init', self.begin, callback + 10, callback + 10)
         self.add('rclcpp_subscription_callback_added', self.begin, callback + 10, callback)
 
+    def timer(self, callback, period):
+        self.add('rcl_timer_init', self.begin, callback + 10, period)
+        self.add('rclcpp_timer_callback_added', self.begin, callback + 10, callback)
+        self.add('rclcpp_timer_link_node', self.begin, callback + 10, 1)
+
     def take(self, callback, time, stamp, number=0):
         """Take a message of LTTng's computer; the system clock of that has its stamp."""
         self.add('rmw_take', time, callback + 10, 0,
                  self.at(stamp) if self.boot == 'boot' else BEGIN + stamp, True, number)
 
-    def run(self, callback, ready, start, end, tid=7, declared=False, fails=False):
+    def run(self, callback, ready, start, end, tid=7, declared=False, fails=False, release=None):
         ids = (0, 0, self.job) if declared else (-1, -1, -1)
         self.job += declared
         if declared:
-            self.add('job_release', ready, 0, ids[2], self.at(ready))
+            self.add('job_release', ready, 0, ids[2],
+                     self.at(ready if release is None else release))
         self.add('dispatch', start, callback, *ids, 0, self.at(ready), 0, 0,
                  *((-1, False) if declared else (5 * MS, True)), tid=tid)
         self.add('callback_start', start, callback, False, tid=tid)

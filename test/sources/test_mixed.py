@@ -113,6 +113,40 @@ def test_without_graph_the_recorded_one_judges(tmp_path):
     assert (found['completed'], found['response_ns']) == (N, same(6500 * US))
 
 
+def test_a_timer_of_this_executor_starts_jobs_that_come_back(tmp_path):
+    """It is due every 100 ms, and noticed 300 us later."""
+    nodes = ('  - {node: /front, callbacks: [{name: grab, timer: 100ms, '
+             'publishes: [/image]DEADLINE},'
+             ' {name: plan, subscription: /boxes, deadline: 20ms}]}\n')
+    own = Own(tmp_path / 'own.mcap', 'mddag: 1\nnodes:\n' + nodes.replace(
+        ', publishes: [/image]DEADLINE', ', deadline: 30ms').replace(
+            '/boxes,', '/boxes, period: 100ms,'))
+    own.node('/front')
+    own.publisher(100, '/image')
+    own.timer(20, 100 * MS)
+    own.subscription(40, '/boxes')
+    r = robot(tmp_path / 'lttng.mcap', until=0)
+    r.node(3, '/detect')
+    r.publisher(101, 3, '/boxes')
+    r.subscription(30, 3, '/image')
+    for k in range(1, N + 1):
+        at = k * 100 * MS
+        own.publish(100, at + 2 * MS)
+        own.run(20, at + 300 * US, at + 500 * US, at + 3 * MS, declared=True, release=at)
+        r.receive(30, 5, at + 4 * MS, at + 8 * MS, at + 2020 * US, style='take')
+        boxes = r.publish(101, 5, at + 7 * MS, style='tracing')
+        own.take(40, at + 9 * MS, boxes)
+        own.run(40, at + 9 * MS, at + 10 * MS, at + 12 * MS)
+    detect = ('  - {node: /detect, callbacks: [{name: detect, subscription: /image, '
+              'publishes: [/boxes]}]}\n')
+    graph = loads('mddag: 1\nnodes:\n' + nodes.replace('DEADLINE', '') + detect, 'graph.yaml')
+    result = replay([own.end(1100 * MS), str(r.write())], graph).result()
+    assert result['warnings'] == []
+    found = result['dags']['/front']['sinks']['/front:plan']
+    assert (found['completed'], found['response_ns']) == (N, same(12 * MS))
+    assert found['breakdown']['mean']['release_lag_ns'] == 300 * US
+
+
 def test_an_execution_that_raised_has_failed(tmp_path, graph):
     result = replay(pair(tmp_path, declared=True, fails=(3, 4)), graph).result()
     ends = result['dags']['/camera']['ends']
