@@ -186,8 +186,10 @@ class MixedRun(UndeclaredRun):
             self._parts[0].reader, ', '.join(paths), self._judge(task_set), None, progress)
         if self._apart is not None and not self._crossed.any():
             raise self._apart
-        default = {part.head.default_deadline for part in self._parts if part.head is not None}
-        self.head = self.head._replace(default_deadline=max(default, default=0))
+        heads = [part.head for part in self._parts if part.head is not None]
+        self.head = self.head._replace(
+            default_deadline=heads[0].default_deadline,
+            file='' if task_set is not None else next((each.file for each in heads), ''))
 
     def _judge(self, given: TaskSet | None) -> TaskSet | None:
         """Return the declaration to judge by."""
@@ -355,7 +357,8 @@ class MixedRun(UndeclaredRun):
         own = {number: self._workers_of[pid] for number, pid in enumerate(self._pids)
                if pid in self._workers_of}
         return self._with_failures(replace(found, run=replace(
-            found.run, own_processes=own, judge_from=self._judge_from(found))))
+            found.run, own_processes=own, judge_from=self._judge_from(found),
+            shut_down=all(part.end is not None for part in self._parts))))
 
     def _judge_from(self, found: Recording) -> int:
         """Return the first release that is judged (rule 4)."""

@@ -111,6 +111,8 @@ def test_without_graph_the_recorded_one_judges(tmp_path):
     found = result['dags']['/detect']['sinks']['/detect:detect']
     # its message is from a callback that the declaration does not know
     assert (found['completed'], found['response_ns']) == (N, same(6500 * US))
+    assert result['recording']['declaration'] == 'own.yaml'
+    assert result['recording']['shut_down']
 
 
 def test_a_timer_of_this_executor_starts_jobs_that_come_back(tmp_path):
@@ -210,6 +212,7 @@ def test_jobs_before_and_after_one_of_the_recordings_are_not_judged(tmp_path, gr
     killed = detector(tmp_path / 'killed.mcap', n=7, first=1, end=None)
     result = replay([killed, str(tmp_path / 'lttng.mcap')], graph).result()
     assert any('its end is not recorded' in line for line in result['warnings'])
+    assert not result['recording']['shut_down']
     assert result['dags']['/camera']['ends']['expired'] > 0
 
 
