@@ -14,7 +14,7 @@ end          processes whose end is not recorded
 empty        the recording, if no job was released in it
 clock        groups of processes whose clock differs from that of the first one; steps of the clock
 callbacks    declared callbacks or DAGs that are not recorded
-twice        processes that two of the recordings have: the events of one are left out
+duplicate    processes that two of the recordings have: the events of one are left out
 stamps       releases by another stamp or time than the declared one
 unjudged     jobs that are not judged
 ===========  =================================================================================
@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Kind = Literal['damage', 'events', 'strange', 'open', 'end', 'empty', 'clock', 'callbacks',
-               'stamps', 'twice', 'unjudged']
+               'stamps', 'duplicate', 'unjudged']
 
 
 @dataclass(frozen=True)

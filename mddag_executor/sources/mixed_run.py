@@ -177,15 +177,15 @@ class MixedRun(UndeclaredRun):
                 imported[1].path, f'it is an imported recording, as {imported[0].path} is',
                 "import all sessions of the run into one: 'mddag import ctf SESSION… -o OUT.mcap'")
         self._parts.sort(key=lambda part: part.is_own)
-        self._apart: ReplayError | None = None
-        self._twice: list[str] = []
+        self._other_run: ReplayError | None = None
+        self._duplicates: list[str] = []
         self._unknown_clocks: list[str] = []
         self._workers_of: dict[int, int] = {}
         self._failed: Ints = np.empty(0, dtype=np.int64)
         super().__init__(
             self._parts[0].reader, ', '.join(paths), self._judge(task_set), None, progress)
-        if self._apart is not None and not self._crossed.any():
-            raise self._apart
+        if self._other_run is not None and not self._joined_executions.any():
+            raise self._other_run
         heads = [part.head for part in self._parts if part.head is not None]
         self.head = self.head._replace(
             default_deadline=heads[0].default_deadline,
@@ -215,11 +215,11 @@ class MixedRun(UndeclaredRun):
         several: list[Events] = []
         count = 0
         for part in self._parts:
-            several.append(part.read(_continued(progress, count)))
+            several.append(part.read(_progress_from(progress, count)))
             count += part.reader.message_count or 0
-        several = self._by_one_clock(self._once(several))
+        several = self._convert_clocks(self._without_duplicates(several))
         self._check_run(several)
-        return self._joined(several)
+        return self._merge(several)
 
     def _check_run(self, several: Sequence[Events]) -> None:
         """
@@ -233,17 +233,17 @@ class MixedRun(UndeclaredRun):
         last = ranges[0][1]
         for begin, end, path in ranges[1:]:
             if begin > last:
-                self._apart = ReplayError(
+                self._other_run = ReplayError(
                     path, f'it is of another run than {ranges[0][2]}: it begins '
                     f'{(begin - last) / 1e9:.3f} s after the end of the others',
                     'give the recordings of one run')
             last = max(last, end)
         boots = {each.boot for part, events in zip(self._parts, several)
                  for each in part.clocks(events).values()}
-        if self._apart is not None and ('' in boots or len(boots) < 2):
-            raise self._apart
+        if self._other_run is not None and ('' in boots or len(boots) < 2):
+            raise self._other_run
 
-    def _once(self, several: list[Events]) -> list[Events]:
+    def _without_duplicates(self, several: list[Events]) -> list[Events]:
         """Leave out what is recorded twice (rule 3)."""
         imported, clocks = several[0], self._parts[0].clocks(several[0])
         table, threads = imported.table, np.array([pid for pid, _ in imported.threads])
@@ -260,7 +260,7 @@ class MixedRun(UndeclaredRun):
                         mine and not mine & _nodes(events).get(pid, set())):
                     continue
                 out.add(pid)
-                self._twice.append(
+                self._duplicates.append(
                     f'{self._parts[0].path}: left out: '
                     f'{counted(int((of == pid).sum()), "event")} of process {pid}, because '
                     f'{part.path} has recorded it as well, and with its executions')
@@ -275,7 +275,7 @@ class MixedRun(UndeclaredRun):
             table=table[kept], others=[e for e in imported.others if e[2] not in out]),
             *several[1:]]
 
-    def _by_one_clock(self, several: list[Events]) -> list[Events]:
+    def _convert_clocks(self, several: list[Events]) -> list[Events]:
         """Convert times of this executor to those of LTTng's recording (rule 2)."""
         known: dict[str, int] = {}
         found = []
@@ -297,7 +297,7 @@ class MixedRun(UndeclaredRun):
             found.append(events)
         return found
 
-    def _joined(self, several: list[Events]) -> Events:
+    def _merge(self, several: list[Events]) -> Events:
         """Return all events as those of one recording, with different ids of processes."""
         processes, tids = Numbers(), Numbers()
         threads: list[tuple[int, int]] = []
@@ -398,19 +398,19 @@ class MixedRun(UndeclaredRun):
     def _damage(self) -> Iterator[Loss]:
         for part in self._parts:
             yield from damage(part.reader.warnings, part.path, part.path)
-        for text in self._twice:
-            yield Loss('twice', 1, text)
+        for text in self._duplicates:
+            yield Loss('duplicate', 1, text)
         for path in self._unknown_clocks:
             yield Loss('clock', 1, (
                 f'{path}: {self._parts[0].path} does not say how its clock was read, so times '
                 'between the two are off by what the system clock was changed: import it again'))
-        for topic, sent, received in self._unjoined():
+        for topic, sent, received in self._missing_topics():
             yield Loss('strange', received, (
                 f'{self.name}: {topic} is not joined: {counted(received, "execution")} for '
                 f'messages that {sent}'))
 
     @property
-    def _crossed(self) -> Mask:
+    def _joined_executions(self) -> Mask:
         """Return which executions were started by a message of the other recording."""
         links = self.links
         sender = links.is_own[self._events.table['thread'][links.messages['at']]]
@@ -418,10 +418,10 @@ class MixedRun(UndeclaredRun):
             np.append(sender, False)[links.runs['message']] != links.own_runs)
         return crossed
 
-    def _unjoined(self) -> Iterator[tuple[str, str, int]]:
+    def _missing_topics(self) -> Iterator[tuple[str, str, int]]:
         """Yield topics of which no message was found in the other recording, and why not."""
         runs, messages, links, crossed = (
-            self.links.runs, self.links.messages, self.links, self._crossed)
+            self.links.runs, self.links.messages, self.links, self._joined_executions)
         topics = {number: topic for topic, number in links.topics.items()}
         start = np.array([links.topics.get(each.start, -1) if each.kind == 'subscription' else -1
                           for each in links.callbacks], dtype=np.int64)[runs['callback']]
@@ -452,7 +452,7 @@ class MixedRun(UndeclaredRun):
                     'is cut): the run goes on without it'))
 
 
-def _continued(
+def _progress_from(
     progress: Function[[int], None] | None, before: int
 ) -> Function[[int], None] | None:
     """Return what is called with the number of events read of a recording."""
