@@ -92,6 +92,8 @@ def _of_several(
 ) -> Recording:
     """Return the recording of a run that has several; one may be imported."""
     paths = [os.fspath(each) for each in traces.paths]
+    if len(paths) == 1 and not traces.offsets:
+        return open_recording(paths[0], task_set, progress=progress)
     if all(read_head(TraceReader(path)) is not None for path in paths):
         from mddag_executor.sources.joining import Joined
         return judged_by(Joined(paths, traces.offsets).recording(progress), task_set)

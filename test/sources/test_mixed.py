@@ -269,6 +269,11 @@ def test_the_commands_take_both(tmp_path, call):
     assert sink(json.loads(result.stdout))['completed'] == N
 
 
+def test_a_list_of_one_recording_is_that_recording(tmp_path, graph):
+    for path in pair(tmp_path):
+        assert replay([path], graph).result()['dags'] == replay(path, graph).result()['dags']
+
+
 def test_recordings_that_cannot_be_joined_are_refused(tmp_path, graph):
     own, lttng = pair(tmp_path, declared=True)
     second = str(robot(tmp_path / 'second.mcap').write())
