@@ -173,18 +173,22 @@ HERITAGE = '_mddag_heritage'
 
 
 def complete_request(
-    client: Any, number: int, response: Any, executor: Any, heritage: Heritage | None = None
+    client: Any, number: int, response: Any, executor: Any,
+    find_heritage: Callable[[], Heritage | None] = lambda: None,
 ) -> None:
     """
     Complete the future of a client's request; its callbacks run in an executor.
 
-    :param heritage: what they inherit; None: nothing.
+    :param find_heritage: returns what they inherit; it is called when the thread that has sent the
+        request has noted that: this waits for the client's lock, with which requests are sent.
     """
     try:
         future = client.get_pending_request(number)
     except KeyError:
-        return  # the request was cancelled
+        find_heritage()  # the request was cancelled: nothing needs it any more
+        return
     future._set_executor(executor)
+    heritage = find_heritage()
     if heritage is not None:
         setattr(future, HERITAGE, heritage)
     future.set_result(response)

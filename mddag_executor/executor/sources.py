@@ -389,5 +389,5 @@ class ClientEntity(ArrivalEntity):
         compat.complete_request(
             self.rclpy_object, number, response,
             pool.outer_groups.get(self.outer) or pool.executor,
-            pool.engine.sent_requests.of_response(self.handle, number))
+            partial(pool.engine.sent_requests.of_response, self.handle, number))
         self.rooms.at_once.handled(self)

@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A service or action is as urgent as the callback with a deadline that has sent the request."""
 
+from functools import partial
 import inspect
 import threading
 import time
+from types import SimpleNamespace
 
 from mddag_executor.core import NEVER, Tables
+from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.kinds import ListenerEntity
 from mddag_executor.executor.sent_requests import SentRequests
@@ -17,6 +20,7 @@ import pytest
 from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
+from rclpy.task import Future
 from std_msgs.msg import Empty
 from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci
@@ -291,6 +295,21 @@ def test_a_request_that_is_taken_before_it_is_noted_is_forgotten_with_its_respon
     requests.send(send, b'client', '/ask', 'handle', (5, 0))
     assert found == [(5, 0)] and not requests.is_empty()
     assert requests.of_response('handle', 7) == (5, 0)
+    assert requests.is_empty()
+
+
+def test_a_response_that_comes_before_its_request_is_noted_is_as_urgent(make_executor):
+    """The sending thread has the client's lock until then."""
+    requests, future = SentRequests(), Future()
+
+    def pending(number):
+        requests.send(lambda: number, b'client', '/ask', 'handle', (5, 0))
+        return future
+
+    compat.complete_request(
+        SimpleNamespace(get_pending_request=pending), 7, Trigger.Response(), make_executor(),
+        partial(requests.of_response, 'handle', 7))
+    assert compat.heritage_of_response((future,)) == (5, 0)
     assert requests.is_empty()
 
 
