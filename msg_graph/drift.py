@@ -27,7 +27,11 @@ The rules are the same for live runs and recordings. Observations are counts by 
 5. A callback may run in another process if all its DAGs may span processes (``release_from:
    header_stamp``) or the declaration has ``processes:``, and its node was not seen here. Then it
    is not reported.
-6. Of consecutive callbacks only the first that differs by rule 2, 3 or 4 is reported: it is the
+6. *published outside*: a node published a topic with which its declared callback starts another
+   one, but neither in the callback nor in code that the callback waits for: in a thread, a task or
+   an undeclared callback.  Such a message belongs to no job.  Declared callbacks that publish a
+   topic without declaring it are rule 1.
+7. Of consecutive callbacks only the first that differs by rule 2, 3 or 4 is reported: it is the
    reason why the others have no messages.
 """
 
@@ -91,6 +95,8 @@ class Observed:
     :ivar publishes: by callback, the topics that it published, declared or not.
     :ivar nodes: the nodes that were seen; None if unknown.
     :ivar undeclared: the undeclared entities that were seen.
+    :ivar outside: messages that no declared callback has published: node, topic, the undeclared
+        callback or task (empty: the thread ran none), and their number.
     :ivar blocked: callbacks that cannot run, as an execution has not ended: they have not stopped.
     :ivar periods: by timer, the period with which it was created, ns; without unknown ones.
     """
@@ -106,6 +112,7 @@ class Observed:
     periods: Mapping[str, int] = field(default_factory=dict)
     end_ns: int = 0
     blocked: Set[str] = frozenset()
+    outside: Sequence[tuple[str, str, str, int]] = ()
 
 
 @dataclass(frozen=True)
@@ -113,8 +120,8 @@ class Drift:
     """
     One difference.
 
-    :ivar kind: ``publishes``, ``rate``, ``stopped`` or ``never ran``.
-    :ivar topic: the undeclared topic that is published, or the one that a sync never got, or None.
+    :ivar kind: ``publishes``, ``published outside``, ``rate``, ``stopped`` or ``never ran``.
+    :ivar topic: the topic that is published, or the one that a sync never got, or None.
     :ivar declared: the declared value: a period in ns, or a number of messages; or None.
     :ivar observed: the observed value, or None.
     """
@@ -141,10 +148,69 @@ def drift(task_set: TaskSet, observed: Observed) -> list[Drift]:
             Drift('publishes', callback.key, topic, None, None,
                   printable(f'{callback.key} publishes {topic}, which it does not declare'))
             for topic in extra]
+    _add_outside(task_set, observed, found)
     suspects = _suspects(task_set, observed)
     for key in _first(task_set, suspects):
         found[key].append(suspects[key])
     return [each for callback in task_set.callbacks for each in found[callback.key]]
+
+
+def _add_outside(
+    task_set: TaskSet, observed: Observed, found: dict[str, list[Drift]]
+) -> None:
+    """Add the messages that nodes published outside of their declared callbacks (rule 6)."""
+    counts: dict[tuple[str, str], dict[str, int]] = {}
+    for node, topic, by, count in observed.outside:
+        of_topic = counts.setdefault((node, topic), {})
+        of_topic[by] = of_topic.get(by, 0) + count
+    for (node, topic), by_code in sorted(counts.items()):
+        callbacks = _starting(task_set, node, topic)
+        text = outside_text(task_set, node, topic, by_code)
+        if text is not None:
+            found[callbacks[0].key].append(Drift(
+                'published outside', callbacks[0].key, topic, None, sum(by_code.values()), text))
+
+
+def _starting(task_set: TaskSet, node: str, topic: str) -> list[Callback]:
+    """Return the callbacks of a node that start other callbacks by a topic."""
+    found = {}
+    for dag in task_set.dags:
+        for vertex in dag.vertices:
+            callback = vertex.callback
+            if callback.node == node and topic in callback.publishes and any(
+                    topic in dag.vertices[after].callback.topics for after in vertex.successors):
+                found[callback.key] = callback
+    return list(found.values())
+
+
+def outside_text(
+    task_set: TaskSet, node: str, topic: str, by_code: Mapping[str, int],
+    only_silent: bool = False,
+) -> str | None:
+    """
+    Return a line about messages that no declared callback has published; None: they start nothing.
+
+    :param by_code: their number by the undeclared callback or task; empty: the thread ran none.
+    :param only_silent: return None as well if results are missed without them, which is seen.
+    """
+    callbacks = _starting(task_set, node, topic)
+    is_silent = any(topic in callback.may_publish for callback in callbacks)
+    if not callbacks or only_silent and not is_silent:
+        return None
+    count = sum(by_code.values())
+    number = f'{count} message{"s" * (count != 1)} on {topic}'
+    names = [by or 'threads of its own' for by in sorted(by_code, key=lambda by: -by_code[by])]
+    keys = ' or '.join(callback.key for callback in callbacks)
+    return printable(
+        f'{node} published {number} in {_some(names)}, after {keys} had ended or without it: '
+        f'{"it belongs" if count == 1 else "they belong"} to no job, and results that need '
+        f'{"it" if count == 1 else "them"} are {"not due" if is_silent else "missed"}. Publish '
+        f'in the callback, let it await or join what publishes'
+        + (', or declare what publishes' if any(by_code) else ''))
+
+
+def _some(names: Sequence[str]) -> str:
+    return ', '.join(names[:3]) + (f' and {len(names) - 3} more' if len(names) > 3 else '')
 
 
 def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
@@ -322,7 +388,7 @@ def _certain(task_set: TaskSet) -> set[str]:
 
 
 def _first(task_set: TaskSet, suspects: Mapping[str, Drift]) -> list[str]:
-    """Return the suspects with no suspect before them in any of their DAGs (rule 6)."""
+    """Return the suspects with no suspect before them in any of their DAGs (rule 7)."""
     explained: set[str] = set()
     for dag in task_set.dags:
         behind = [False] * len(dag.vertices)

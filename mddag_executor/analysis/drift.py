@@ -83,24 +83,34 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     for vertex in distinct(completed).tolist():
         came.pop(vertices[vertex].callback.key, None)   # it got all of them
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
+    outside: Counter[tuple[str, str, str]] = Counter()
     sent = recording.publications
     publishers, publisher_of = different(sent['publisher'])
-    by = np.flatnonzero(sent['execution'] >= 0)
-    pairs = np.flatnonzero(np.bincount(
-        publisher_of[by].astype(np.int64) * len(numbers) + callback_of[sent['execution'][by]]))
-    for pair in pairs.tolist():
-        number = int(publishers[pair // len(numbers)])
-        callback = int(numbers[pair % len(numbers)])
+    # the last callback is for publications in no execution
+    pair_of = publisher_of.astype(np.int64) * (len(numbers) + 1) + np.append(
+        callback_of, len(numbers))[sent['execution']]
+    is_judged = (sent['time'] >= max(since, recording.run.judge_from)) & (
+        sent['time'] <= recording.run.judged_until)
+    judged_counts = np.bincount(pair_of[is_judged], minlength=int(pair_of.max(initial=0)) + 1)
+    for pair in np.flatnonzero(np.bincount(pair_of)).tolist():
+        number, place = int(publishers[pair // (len(numbers) + 1)]), pair % (len(numbers) + 1)
+        callback = int(numbers[place]) if place < len(numbers) else None
         publisher = names.publishers.get(number)
-        if callback in keys and publisher is not None and publisher.node is not None:
+        if publisher is None or publisher.node is None:
+            continue
+        if callback in keys:
             publishes[keys[callback]] |= {publisher.topic}
+        elif callback is not None or not recording.run.links:    # the events may be lost
+            outside[publisher.node.name, publisher.topic, (
+                '' if callback is None else names.name(callback))] += int(judged_counts[pair])
     bound = declared_keys(names, judge)
     return drift(judge, Observed(
         max(0, recording.end - recording.run.begin), releases,
         dict(got), dict(ran), came, publishes, set(names.nodes) or None,
         [each.entity for each in names.made
          if each.entity is not None and each.number not in bound], periods, recording.end,
-        _blocked(recording, keys)))
+        _blocked(recording, keys),
+        [(*key, count) for key, count in outside.items() if count]))
 
 
 def _blocked(recording: Recording, keys: Mapping[int, str]) -> set[str]:

@@ -262,9 +262,11 @@ class Paths:
         """Return the recorded publications of a callback among those on a topic."""
         table, sent = self._table, self._recording.publications
         vertex = sent['vertex'][mine]
+        # one outside of callbacks is none of a callback; of an imported execution, events are lost
+        is_callback = (sent['execution'][mine] >= 0) | self._recording.run.links
         mine = mine[np.where(
             vertex >= 0, self._place[vertex] == self._places[callback.key],
-            self._node[mine] == self._nodes[callback.node])]
+            is_callback & (self._node[mine] == self._nodes[callback.node]))]
         by, known = sent['execution'][mine], sent['vertex'][mine] >= 0
         message = mine if self._recording.run.links else np.where(
             (by >= 0) & known, self._message(table['job'][by], table['vertex'][by], topic), NONE)

@@ -37,6 +37,7 @@ import types
 from typing import Any, Protocol
 
 from mddag_executor.executor.compat import awaited, NEXT_TURN, QuickCallback
+from mddag_executor.executor.starters import forget_starter
 
 CLOSE_S = 2.0
 """How long cancelled tasks may take to end."""
@@ -269,6 +270,7 @@ class CallbackLoop(asyncio.SelectorEventLoop):
                 runs = threading.Event()
                 self.call_soon_threadsafe(runs.set)
                 thread = threading.Thread(target=self._run, name='mddag-asyncio', daemon=True)
+                forget_starter(thread)  # it runs tasks of other executions as well
                 thread.start()
                 self._thread = thread
                 runs.wait()

@@ -30,7 +30,7 @@ from mddag_executor.executor.sent_requests import ACTION, Heritage
 import rclpy
 import rclpy.client
 from rclpy.exceptions import InvalidHandle
-from rclpy.executors import Executor
+from rclpy.executors import Executor, MultiThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.subscription import Subscription
@@ -485,7 +485,7 @@ def awaited(coroutine: Any) -> Any:
 
 def requested_service(future: Any) -> str:
     """Return the name of the service whose response a future is; empty: it is another future."""
-    for callback in tuple(getattr(future, '_callbacks', ())):
+    for callback in tuple(getattr(future, '_callbacks', None) or ()):  # asyncio's may be None
         client = getattr(callback, '__self__', None)
         if isinstance(client, rclpy.client.Client):
             return service_name(client)
@@ -541,6 +541,12 @@ class BareExecutor(Executor):
 
     def _call_task_in_next_spin(self, task: Task) -> None:
         """Do nothing: the executor calls a task (7.1.9) again by itself."""
+
+
+def joins_threads(kind: type[Any]) -> bool:
+    """Return whether an executor's class joins its threads in ``shutdown``. 9.1 has the option."""
+    return issubclass(kind, MultiThreadedExecutor) and 'wait_for_threads' in inspect.signature(
+        MultiThreadedExecutor.shutdown).parameters
 
 
 class _FirstNode:

@@ -23,6 +23,7 @@ import sys
 import threading
 from typing import TYPE_CHECKING
 
+from mddag_executor.executor.publishing import unwatch
 from mddag_executor.executor.unfinished import unfinished
 
 if TYPE_CHECKING:
@@ -76,6 +77,7 @@ class Ending:
         for each in (self.diagnostics, self.wait_sets):
             if each is not None:
                 each.stop()
+        unwatch(self._pool)
         if self.upkeep is not None:
             self.upkeep.clear()
         for announcements in self.announcements:

@@ -900,12 +900,19 @@ class Engine:
 
     def publishes(
         self, work: Work | None, publisher: Any, state: PublisherState, message: Any, now: int,
-        vtid: int,
+        vtid: int, is_on_behalf: bool = False,
     ) -> None:
-        """Note that a callback publishes, while ``notes_publications``; without the lock."""
+        """
+        Note that a callback publishes, while ``notes_publications``; without the lock.
+
+        :param work: the execution; None: a thread of the program's own publishes.
+        :param is_on_behalf: whether other code publishes on behalf of the execution.
+        """
         if self._records is not None:
             if self.recorder is not None and state.recorded_by != self.recorder.number:
                 self.recorder.publisher(publisher, state)
+            if is_on_behalf and work is not None:
+                self._records.on_behalf(work, self.origin_of(work) or NO_ORIGIN, now, vtid)
             self._records.publication(state.address, message, now, vtid)
         topic, watch = state.topic, self.path_watch
         if work is not None and watch is not None and topic in watch.topics:

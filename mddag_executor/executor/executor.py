@@ -51,6 +51,7 @@ from mddag_executor.executor.interrupts import InterruptsDeferred, wait_readable
 from mddag_executor.executor.loop import raise_limit
 from mddag_executor.executor.misses import MissNotifier
 from mddag_executor.executor.outer_groups import outer_here, OuterGroup
+from mddag_executor.executor.outside import Outside, Outsiders
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry
 from mddag_executor.executor.sent_requests import Heritage
@@ -243,6 +244,9 @@ class MultiDeadlineExecutor(BareExecutor):
         self._upkeep = self._ending.upkeep = Upkeep(
             weakly(self._nodes_to_serve), self._registry, self._pool, self._at_once,
             self._wait_sets)
+        if task_set is not None:
+            self._pool.outside = Outside(task_set, weakly(self._nodes_to_serve))
+            publishing.watch(self._pool)
         self._diagnostics: Diagnostics | None = None
         if every_ns is not None:
             self._diagnostics = self._ending.diagnostics = Diagnostics(
@@ -780,7 +784,9 @@ class MultiDeadlineExecutor(BareExecutor):
 
     # --- the end ---------------------------------------------------------------------------------
 
-    def shutdown(self, timeout_sec: float | None = None) -> bool:
+    def shutdown(
+        self, timeout_sec: float | None = None, *, wait_for_threads: bool = False
+    ) -> bool:
         """
         Start no more callbacks and wait for the running ones.
 
@@ -788,7 +794,9 @@ class MultiDeadlineExecutor(BareExecutor):
         spin ends and does the rest.
 
         :param timeout_sec: seconds to wait; None or negative: for ever; 0: do not wait.
-        :return: whether all have finished.
+        :param wait_for_threads: whether to wait for the threads of the pool even longer than that,
+            as Kilted's ``MultiThreadedExecutor`` does by default.
+        :return: whether all callbacks have finished before the timeout.
         """
         if timeout_sec is not None and not 0 <= timeout_sec < threading.TIMEOUT_MAX:
             timeout_sec = None
@@ -800,15 +808,18 @@ class MultiDeadlineExecutor(BareExecutor):
             return False
         self.wake()
         self._pool.pause()
-        if not self._pool.close(timeout_sec):
-            return False
+        in_time = self._pool.close(timeout_sec)
+        if not in_time:
+            if not wait_for_threads:
+                return False
+            self._pool.close(None)
         self._ending.end_run()
         reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
         if self._spinning.acquire(blocking=False):  # else the spin does that at its end
             self._ending.close()
             self._spinning.release()
-        return finished and reported
+        return finished and reported and in_time
 
     def abandon_callbacks(self) -> None:
         """After ``shutdown``, judge open jobs and complete the trace, though callbacks run."""
@@ -871,6 +882,11 @@ class MultiDeadlineExecutor(BareExecutor):
         """Return the executor; it is shut down at the end of the block."""
         super().__enter__()
         return self
+
+    def published_outside(self) -> Outsiders:
+        """Return how many messages no declared callback has published (``outside``)."""
+        outside = self._pool.outside
+        return () if outside is None else outside.counts()
 
     def statistics(self) -> Statistics:
         """Return a snapshot of the counts so far: see ``Statistics`` for its keys."""

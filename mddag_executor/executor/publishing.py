@@ -26,9 +26,11 @@ the first executor is made.
 6.  *A triggered guard condition* is announced like a message, because rcl has no listener for it.
     The method of its handle is wrapped, which also those call that have no ``GuardCondition``.
 7.  *A request* that a callback with a deadline sends is noted: it inherits (``sent_requests``).
+8.  *Code that a callback has started* publishes on its behalf (``starters``).  Other messages on
+    the topics of declared callbacks belong to no job, and are counted (``outside``).
 
-The methods are unchanged outside of callbacks of this executor, on topics without a subscription
-of an executor here.
+The methods are unchanged outside of callbacks of this executor, on topics that no callback is
+declared to publish and that have no subscription of an executor here.
 """
 
 from __future__ import annotations
@@ -36,8 +38,16 @@ from __future__ import annotations
 from functools import partial
 import threading
 from typing import Any
+import weakref
 
-from mddag_executor.executor.attribution import NO_ORIGIN, Publication, PublisherState
+from mddag_executor.executor import starters
+from mddag_executor.executor.attribution import (
+    NO_ORIGIN,
+    Origin,
+    Publication,
+    PublisherState,
+    Topic,
+)
 from mddag_executor.executor.compat import (
     ACTION_REQUESTS,
     CLIENT_HANDLE,
@@ -51,7 +61,8 @@ from mddag_executor.executor.interrupts import runs_callbacks
 from mddag_executor.executor.listeners import announce_trigger
 from mddag_executor.executor.request_ids import id_of_client
 from mddag_executor.executor.sent_requests import Heritage
-from mddag_executor.executor.work import current, Runner
+from mddag_executor.executor.starters import starter_outside
+from mddag_executor.executor.work import current, Runner, starter_here
 from rclpy.client import Client
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -85,16 +96,14 @@ class LocalDelivery:
             if source.rclpy_object is subscription:
                 source.listen_again()
 
-    def collect_published(
-        self, publication: Publication | None, running: Runner | None
-    ) -> None:
+    def collect_published(self, publication: Publication | None, of: Any) -> None:
         """
         Collect the arrivals announced since a publication began, and resume announcements.
 
-        :param running: what runs the callback that has published; None: it was none of ours.
+        :param of: the pool that runs the execution that has published; None: it was none of ours.
         """
         pool = self.pool
-        if running is None or running.pool is not pool:
+        if of is not pool:
             publication = None  # of another executor, with other jobs
         if not pool.is_inside():
             with pool.lock:
@@ -111,7 +120,9 @@ class LocalDelivery:
 
 _STATE = '_mddag_publisher_state'
 _deliveries: dict[str, tuple[LocalDelivery, ...]] = {}
-_lock = threading.Lock()
+# by topic: the pools of executors with a callback that is declared to publish it
+_watching: dict[str, tuple[weakref.ref[Any], ...]] = {}
+_lock = threading.RLock()  # a finalizer may come anywhere
 _installed = False
 
 
@@ -157,6 +168,25 @@ def replace_delivery(topic: str, old: LocalDelivery | None, new: LocalDelivery |
             _deliveries.pop(topic, None)
 
 
+def watch(pool: Any) -> None:
+    """Notice all messages on the topics that the declared callbacks of an executor publish."""
+    reference = weakref.ref(pool)
+    with _lock:
+        for topic in pool.engine.attribution.topics:
+            _watching[topic] = (*_watching.get(topic, ()), reference)
+
+
+def unwatch(pool: Any) -> None:
+    """End ``watch``, also for executors that have been destroyed."""
+    with _lock:
+        for topic, several in list(_watching.items()):
+            rest = tuple(each for each in several if each() not in (None, pool))
+            if rest:
+                _watching[topic] = rest
+            else:
+                del _watching[topic]
+
+
 def state_of(publisher: Any) -> PublisherState:
     """Return the state of a publisher, which begins with the first use."""
     state: PublisherState = publisher.__dict__.setdefault(
@@ -165,33 +195,103 @@ def state_of(publisher: Any) -> PublisherState:
 
 
 def _send(
-    original: Any, publisher: Any, msg: Any, state: PublisherState, running: Runner | None
+    original: Any, publisher: Any, msg: Any, state: PublisherState, running: Runner
 ) -> Publication | None:
-    """Publish; return the publication if a callback published on a trigger topic."""
-    topic = None
-    if running is not None:
+    """Publish in a callback; return the publication if it was on a trigger topic."""
+    engine, work = running.engine, running.work
+    topic = engine.attribution.topics.get(state.topic)
+    origin = None if work is None else work.origin or work.answers
+    if topic is None or origin is not None:
         running.publishes(publisher, state, msg)
-        topic = running.engine.attribution.topics.get(state.topic)
-    if running is not None and topic is None and not state.is_tracked:
+    else:
+        claim = None if work is None or work.starter is None else (
+            work.starter.claim(state.topic, msg))
+        if claim is not None and claim.pool is running.pool:
+            running.publishes(publisher, state, msg, claim.work)
+            return _send_noted(original, publisher, msg, state, engine, topic, claim.origin)
+        running.publishes(publisher, state, msg)
+        if work is None or work.entity.callback is None:
+            _note_outside(
+                running.pool, publisher, state, '' if work is None else work.entity.name)
+    if topic is None and not state.is_tracked:
         original(publisher, msg)
         return None
+    if topic is None:
+        _send_counted(original, publisher, msg, state)
+        return None
+    if work is not None and work.entity.awaiting is not None:
+        engine.answers.note_published(work, state.topic, msg)
+        origin = work.origin or work.answers
+    return _send_noted(
+        original, publisher, msg, state, engine, topic, origin or NO_ORIGIN)
+
+
+def _send_noted(
+    original: Any, publisher: Any, msg: Any, state: PublisherState, engine: Any, topic: Topic,
+    origin: Origin,
+) -> Publication:
+    """Publish on a trigger topic; return the publication."""
     with state.lock:
         state.count += 1
+        state.is_tracked = True
         try:
-            if running is None or topic is None:
-                original(publisher, msg)
-                return None
-            state.is_tracked = True
-            work = running.work
-            if work is not None and work.entity.awaiting is not None:
-                running.engine.answers.note_published(work, state.topic, msg)
-            origin = None if work is None else work.origin or work.answers
-            publication: Publication = running.engine.attribution.publish(
-                original, publisher, msg, state, topic, origin or NO_ORIGIN)
+            publication: Publication = engine.attribution.publish(
+                original, publisher, msg, state, topic, origin)
             return publication
         except BaseException:
             state.count -= 1  # the middleware has not counted it
             raise
+
+
+def _send_counted(original: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
+    """Publish a message that belongs to no job with a publisher of which messages are counted."""
+    with state.lock:
+        state.count += 1
+        try:
+            original(publisher, msg)
+        except BaseException:
+            state.count -= 1
+            raise
+
+
+def _send_outside(
+    original: Any, publisher: Any, msg: Any, state: PublisherState
+) -> tuple[Publication | None, Any]:
+    """
+    Publish outside of callbacks.
+
+    :return: the publication if it is on behalf of an execution, and the pool that runs this.
+    """
+    watching = _watching.get(state.topic)
+    starter = None if watching is None else starter_outside()
+    claim = None if starter is None else starter.claim(state.topic, msg)
+    for reference in watching or ():
+        pool = reference()
+        if pool is not None and (claim is None or claim.pool is pool):
+            if pool.engine.notes_publications:
+                pool.engine.publishes(
+                    None if claim is None else claim.work, publisher, state, msg,
+                    pool.clock.now(), threading.get_native_id(), claim is not None)
+            if claim is None:
+                _note_outside(pool, publisher, state, '')
+    if claim is None:
+        if state.is_tracked:
+            _send_counted(original, publisher, msg, state)
+        else:
+            original(publisher, msg)
+        return None, None
+    claim.work.entity.publishes.add(state.topic)
+    engine = claim.pool.engine
+    return _send_noted(
+        original, publisher, msg, state, engine, engine.attribution.topics[state.topic],
+        claim.origin), claim.pool
+
+
+def _note_outside(pool: Any, publisher: Any, state: PublisherState, by: str) -> None:
+    outside = pool.outside
+    if outside is not None:
+        with state.lock:
+            outside.note(publisher, state, by, pool.running and pool.engine.is_judging)
 
 
 def publish_as_executor(publisher: Publisher, msg: Any) -> None:
@@ -242,6 +342,7 @@ def install() -> None:
         if _installed:
             return
         _installed = True
+    starters.install(starter_here)
     send = Publisher.publish
     call = Client.call
     set_filter = getattr(Subscription, 'set_content_filter', None)
@@ -253,20 +354,23 @@ def install() -> None:
         running = current.running
         deliveries = _deliveries.get(state.topic)
         if deliveries is None:
-            if running is None and not state.is_tracked:
-                send(self, msg)
-            else:
+            if running is not None:
                 _send(send, self, msg, state, running)
+            else:
+                _send_outside(send, self, msg, state)
             return
-        publication = None
+        publication, pool = None, None if running is None else running.pool
         try:  # an interrupt at any place must not leave the descriptors switched off
             for delivery in deliveries:
                 if delivery.pool.polling:
                     delivery.mute()
-            publication = _send(send, self, msg, state, running)
+            if running is not None:
+                publication = _send(send, self, msg, state, running)
+            else:
+                publication, pool = _send_outside(send, self, msg, state)
         finally:
             for delivery in deliveries:
-                delivery.collect_published(publication, running)
+                delivery.collect_published(publication, pool)
 
     @runs_callbacks
     def call_and_wait(self: Any, request: Any, *args: Any, **kwargs: Any) -> Any:

@@ -47,6 +47,11 @@ class RunRecords:
         """Record that the middleware dropped messages."""
         self._record('messages_lost', now, get_native_id(), entity.address, count)
 
+    def on_behalf(self, work: Work, origin: Origin, now: int, vtid: int) -> None:
+        """Record on behalf of which execution a thread publishes next, at the same time."""
+        _, _, job, _ = origin
+        self._record('on_behalf', now, vtid, work.entity.address, job, work.ready_ns)
+
     def publication(self, address: int, message: Any, now: int, vtid: int) -> None:
         """Record that a thread publishes."""
         self._record(

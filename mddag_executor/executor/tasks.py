@@ -33,7 +33,8 @@ from mddag_executor.executor.compat import (
     QuickCallback,
 )
 from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.work import current, TaskWork, Work
+from mddag_executor.executor.starters import set_starter
+from mddag_executor.executor.work import current, starter_here, TaskWork, Work
 from rclpy.task import Future
 
 if TYPE_CHECKING:
@@ -250,10 +251,11 @@ def make_task(
     if inspect.iscoroutine(callback):
         from mddag_executor.executor.coroutines import Steps  # with asyncio, when it is needed
         steps = Steps(callback, None if loops is None else loops())
+        set_starter(steps.get_context(), starter_here())
         callback = steps.as_coroutine()
     task = ObservedTask(callback, args, kwargs, executor=executor)
     work = TaskWork(entity, task)
-    work.coroutine = steps
+    work.coroutine, work.starter = steps, starter_here()
     work.then = unclaimed.ended
     if steps is not None:
         Future.add_done_callback(task, QuickCallback(partial(resume, work)))  # not an observer

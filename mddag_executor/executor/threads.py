@@ -159,11 +159,14 @@ class WorkerThread:
         if pause is not None:
             pause.wait_for_it()
 
-    def publishes(self, publisher: Any, state: PublisherState, msg: Any) -> None:
-        """Note that the running callback publishes."""
-        topic, work, engine = state.topic, self.work, self.engine
+    def publishes(
+        self, publisher: Any, state: PublisherState, msg: Any, of: Work | None = None
+    ) -> None:
+        """Note that the running callback publishes; ``of``: on behalf of this execution."""
+        topic, work, engine = state.topic, of or self.work, self.engine
         if engine.notes_publications:
-            engine.publishes(work, publisher, state, msg, self.pool.clock.now(), self.vtid)
+            engine.publishes(
+                work, publisher, state, msg, self.pool.clock.now(), self.vtid, of is not None)
         if work is not None and topic not in work.entity.publishes:
             work.entity.publishes.add(topic)
         if not self.published:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal, TYPE_CHECKING
 
+from mddag_executor.executor.outside import since
 from mddag_executor.results.runs import CallbackCounts, Statistics
 from msg_graph import TaskSet
 from msg_graph.drift import Drift, drift, Observed, Releases
@@ -31,6 +32,7 @@ class Watch:
         self._end: int | None = None
         self._releases = [Releases() for _ in task_set.dags]
         self._before: Mapping[str, CallbackCounts] = {}
+        self._outside_before = self._outside = executor.published_outside()
         executor._engine.verdicts.on_release = self._released
 
     def _released(self, dag: int, release: int) -> None:
@@ -42,11 +44,13 @@ class Watch:
         self._begin = self._now()
         self._releases = [Releases() for _ in self._task_set.dags]
         self._before = self._executor.statistics()['callbacks']
+        self._outside_before = self._executor.published_outside()
 
     def stop(self) -> None:
         """Watch no longer: the run has ended."""
         if self._end is None:
             self._end = self._now()
+            self._outside = self._executor.published_outside()
 
     def drift(self, statistics: Statistics) -> list[Drift]:
         """Return the differences between run and declaration; ``statistics`` are its counts."""
@@ -65,7 +69,10 @@ class Watch:
             topics_received={**self._executor._registry.received()},
             publishes={**self._executor._registry.bindings.published()},
             nodes={key.rpartition(':')[0] for key in counts},
-            undeclared=self._executor._registry.bindings.undeclared())
+            undeclared=self._executor._registry.bindings.undeclared(),
+            outside=since(
+                self._executor.published_outside() if self._end is None else self._outside,
+                self._outside_before))
 
     def _since_begin(
         self, counts: Mapping[str, CallbackCounts], which: Literal['ready', 'ran'],

@@ -30,6 +30,7 @@ from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.compat import cancel_running
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.interrupts import runs_callbacks
+from mddag_executor.executor.starters import set_starter, Starter, starter_outside
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 
@@ -46,8 +47,8 @@ class Runner(Protocol):
     def job(self) -> tuple[str, int, int] | None:
         """Return DAG, index and release of its job."""
 
-    def publishes(self, publisher: Any, state: Any, msg: Any) -> None:
-        """Note that the callback publishes."""
+    def publishes(self, publisher: Any, state: Any, msg: Any, of: Work | None = None) -> None:
+        """Note that the callback publishes; ``of``: on behalf of this execution."""
 
     def lend(self, waits_for: str = '') -> AbstractContextManager[Any]:
         """Lend the worker while entered."""
@@ -64,11 +65,24 @@ current = _Current()
 """For the calling thread: ``running``, a ``Runner`` while a callback runs in it."""
 
 
+def starter_here() -> Starter | None:
+    """Return the starter of what the calling thread starts; None: it works for no job."""
+    running = current.running
+    if running is None:
+        return starter_outside()
+    work = running.work
+    if work is None or work.origin is not None or work.answers is not None:
+        return None if work is None else Starter(work, running.pool)
+    return work.starter
+
+
 def new_steps(coroutine: Any) -> Any:
     """Return the steps of a coroutine that the calling thread's callback has returned."""
     from mddag_executor.executor.coroutines import Steps  # with asyncio, when it is needed
     running = current.running
-    return Steps(coroutine, None if running is None else running.pool.loops())
+    steps = Steps(coroutine, None if running is None else running.pool.loops())
+    set_starter(steps.get_context(), starter_here())
+    return steps
 
 
 def is_cancelled(error: BaseException) -> bool:
@@ -99,6 +113,7 @@ class Work:
     :ivar published: of a driven sync, the topics that it has published.
     :ivar sent: its publications on topics of ``PathWatch.topics``, with their times.
     :ivar heritage: what it inherits (see ``sent_requests``); None: nothing.
+    :ivar starter: of a task: the execution on whose behalf it runs; None: none.
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar due_ns: when its timer was due, on the trace's clock; 0: it is of no timer.
@@ -114,6 +129,7 @@ class Work:
     origin: Origin | None = None
     answers: Origin | None = None
     heritage: tuple[int, int] | None = None
+    starter: Starter | None = None
     published: frozenset[str] = frozenset()
     sent: tuple[tuple[str, int], ...] = ()
     x = worker = -1

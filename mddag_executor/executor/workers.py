@@ -61,6 +61,7 @@ from mddag_executor.executor.hall import Announced, Spinner
 from mddag_executor.executor.lending import Lending
 from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
+from mddag_executor.executor.outside import Outside
 from mddag_executor.executor.pausing import can_pause, Pauses
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.stamps import StampedReleases
@@ -169,6 +170,8 @@ class WorkerPool:
         self._loops: Loops | None = None
         self.now = 0
         self.due = DueTimes(self)
+        #: counts messages that no declared callback has published; None: nothing is declared
+        self.outside: Outside | None = None
 
     def loops(self) -> Loops:
         """Return the event loops of coroutines, made for the first one."""

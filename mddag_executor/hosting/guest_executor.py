@@ -24,7 +24,7 @@ import threading
 import time
 from typing import Any, Protocol
 
-from mddag_executor.executor.compat import is_called_by_spin
+from mddag_executor.executor.compat import is_called_by_spin, joins_threads
 from mddag_executor.executor.interrupts import interruptible_sleep, InterruptsDeferred
 from mddag_executor.executor.outer_groups import outer_here
 from mddag_executor.executor.tasks import watched
@@ -323,10 +323,25 @@ class GuestExecutor:
         if self.host.executor is not None:
             self.host.executor.wake()
 
-    def shutdown(self, timeout_sec: float | None = None, **more: Any) -> bool:
-        """Remove all nodes and end all spins."""
+    def shutdown(
+        self, timeout_sec: float | None = None, *, wait_for_threads: bool | None = None
+    ) -> bool:
+        """
+        Remove all nodes and end all spins.
+
+        :param wait_for_threads: whether to wait for the callbacks that run; None: if the program's
+            own executor would (Kilted's ``MultiThreadedExecutor``).
+        """
         self._is_stopped = True
         self.wake_waiting()
+        if wait_for_threads is None:
+            wait_for_threads = joins_threads(type(self))
+        if wait_for_threads and self.has_spun:
+            own = outer_here()
+            for group in self._groups():
+                while group.number != own and group.n_running() and (
+                        not self.host.is_over(self.guest)):
+                    time.sleep(_POLL_S)
         for node in Executor.get_nodes(self):  # type: ignore[arg-type]
             self.remove_node(node)
         return bool(Executor.shutdown(self, timeout_sec))  # type: ignore[arg-type]

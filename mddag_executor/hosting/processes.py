@@ -407,4 +407,5 @@ def _observed(task_set: TaskSet, results: Results) -> Observed:
         releases=releases, messages=messages, executions=executions,
         topics_received=received, publishes={**publishes},
         nodes={c.node for c in task_set.callbacks if str(task_set.process_of(c.node)) in parts},
-        undeclared=[Entity(*each) for part in parts.values() for each in part['undeclared']])
+        undeclared=[Entity(*each) for part in parts.values() for each in part['undeclared']],
+        outside=[tuple(each) for part in parts.values() for each in part['outside']])

@@ -321,16 +321,17 @@ class DriftResult(TypedDict):
     """A difference between a run and its declaration."""
 
     kind: str
-    """`publishes`, `rate`, `stopped` or `never ran`."""
+    """`publishes`, `published outside`, `rate`, `stopped` or `never ran`."""
     callback: str
     """The callback that it is about."""
     topic: str | None
-    """The undeclared topic that is published, or the topic that a sync never got; else null."""
+    """The topic that is published, or the topic that a sync never got; else null."""
     declared: int | None
     """The declared value, a period in ns or a number of messages; null if there is none."""
     observed: int | None
     """
-    The observed value, of `stopped` the time since the last release in ns; null if there is none.
+    The observed value, of `published outside` the number of messages, of `stopped` the time since
+    the last release in ns; null if there is none.
     """
     text: str
     """The difference in words."""

@@ -9,7 +9,8 @@ Theory of operation
    No event is dropped because of its time.
 2. ``executions`` joins the events of executions.
 3. A publication belongs to the execution that ran in its thread at that time, or of several that
-   ended or started then, to the first one that is completed after it in the file.
+   ended or started then, to the first one that is completed after it in the file.  If it was made
+   on behalf of another execution, ``on_behalf`` says so.
 4. The core processed events in the order of their times, equal times in the order of the file.
 """
 
@@ -77,11 +78,11 @@ import numpy as np
 _INIT, _PUBLISH, _RELEASE = (
     'ros2_caret:caret_init', 'ros2:rclcpp_publish', 'mddag:job_release')
 (_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
- _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP) = (
+ _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP, _ON_BEHALF) = (
     f'mddag:{name}' for name in (
         'deadline', 'demote', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop',
         'hosted', 'shutdown', 'judge_from', 'messages_lost', 'unfinished',
-        'clock_step'))
+        'clock_step', 'on_behalf'))
 _FIELDS = {
     DISPATCH: 'vtid callback dag vertex job worker ready reference_deadline cpu_time '
               'held_interpreter',
@@ -91,6 +92,7 @@ _FIELDS = {
     _DEADLINE: 'dag vertex job deadline completed', _DEMOTE: 'dag vertex job',
     _FAIL: 'dag vertex job', _EXPIRE: 'dag job', _ABORT: 'dag job', _OUTDATE: 'dag job',
     _LOST: 'count', _CLOCK_STEP: 'step', _MESSAGES_LOST: 'callback count', _STOP: 'begin end',
+    _ON_BEHALF: 'vtid callback job ready',
     _JUDGE_FROM: 'release', _SHUTDOWN: 'end'}
 """The used fields of events that have only numbers."""
 _ROWS = {name: np.dtype([(field, 'i8') for field in ('place', 'timestamp', *fields.split())])
@@ -327,6 +329,7 @@ class _Source:
             published = published[sort_by(time)]
             time = published['timestamp']
         by = running_at(executions, completed, published['vtid'], time, published['place'])
+        self._on_behalf(executions, published, by)
         table = rows(
             PUBLICATIONS, len(published), publisher=published['publisher_handle'],
             execution=by, vertex=UNKNOWN, time=time, source_timestamp=UNKNOWN,
@@ -334,6 +337,22 @@ class _Source:
         known = by >= 0     # a killed run may have publications, and no execution
         table['vertex'][known] = executions['vertex'][by[known]]
         return table
+
+    def _on_behalf(self, executions: Table, published: Table, by: Ints) -> None:
+        """Correct the executions of publications that were made on behalf of others (rule 3)."""
+        said = self._pop(_ON_BEHALF)
+        if not len(said):
+            return
+        number = {key: row for row, key in enumerate(zip(
+            published['vtid'].tolist(), published['timestamp'].tolist()))}
+        mine = np.flatnonzero(np.isin(executions['callback'], said['callback']))
+        keys = executions[['callback', 'job', 'ready']][mine].tolist()
+        row_of = dict(zip(keys[::-1], mine[::-1].tolist()))     # the first piece
+        for thread, time, *key in zip(*(said[name].tolist() for name in (
+                'vtid', 'timestamp', 'callback', 'job', 'ready'))):
+            at = number.get((thread, time), -1)
+            if at >= 0:
+                by[at] = row_of.get(tuple(key), UNKNOWN)
 
     def _releases(self, released: Table) -> tuple[Table, Ints]:
         """Return the releases, and their positions in the file."""

@@ -171,6 +171,9 @@ _ALL = (
     _event('mddag', 'deadline',
            dag=_I32, vertex=_I32, job=_I64, deadline=_I64, completed=_I64),
     _event('mddag', 'drop', callback=_U64, dag=_I32, vertex=_I32, job=_I64, reason=_STR),
+    # the next publication of this thread, which has the same time, is on behalf of an execution of
+    # another thread, given by its callback, job (-1: none) and ready time
+    _event('mddag', 'on_behalf', callback=_U64, job=_I64, ready=_I64),
     # messages of a subscription that the middleware dropped before the one that is taken now
     _event('mddag', 'messages_lost', callback=_U64, count=_I64),
     _event('mddag', 'demote', dag=_I32, vertex=_I32, job=_I64),

@@ -223,6 +223,25 @@ def test_shutdown_waits_for_a_running_callback(make_executor):
         assert done
 
 
+def test_shutdown_may_wait_for_threads_beyond_its_timeout(make_executor):
+    """As Kilted's MultiThreadedExecutor does."""
+    executor = make_executor()
+    may_end, begun, done = threading.Event(), threading.Event(), []
+
+    def work():
+        begun.set()
+        assert may_end.wait(60.0)
+        done.append(1)
+
+    executor.create_task(work)
+    with Spinning(executor):
+        assert begun.wait(60.0)
+        assert not executor.shutdown(0.01, wait_for_threads=False)
+        threading.Timer(0.05, may_end.set).start()
+        assert not executor.shutdown(0.01, wait_for_threads=True)
+        assert done
+
+
 @pytest.mark.parametrize('timeout', [0, None])
 def test_a_callback_may_shut_the_executor_down(make_executor, make_node, timeout):
     """It hangs in rclpy: rclpy#1646."""

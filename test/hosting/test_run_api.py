@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 from mddag_executor.errors import MddagError, UsageError, UserCodeError
 from mddag_executor.hosting import run, RunOptions, RunResult, RunWarning
@@ -17,6 +18,7 @@ import msg_graph
 from msg_graph import GraphError
 import pytest
 import rclpy
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 
 GRAPH = """\
@@ -49,6 +51,29 @@ def returns_three():
     rclpy.spin_once(Api(), timeout_sec=0.1)
     rclpy.shutdown()
     return 3
+
+
+def waits_for_its_threads():
+    rclpy.init()
+    node, begun, done = Node('waits'), threading.Event(), []
+
+    def work():
+        timer.cancel()
+        begun.set()
+        time.sleep(0.3)
+        done.append(1)
+
+    timer = node.create_timer(0.01, work)
+    executor = MultiThreadedExecutor(2)
+    executor.add_node(node)
+    thread = threading.Thread(target=executor.spin)
+    thread.start()
+    assert begun.wait(60.0)
+    executor.shutdown(wait_for_threads=True)
+    has_waited = bool(done)
+    rclpy.shutdown()
+    thread.join()
+    return 3 if has_waited else 4
 
 
 def wrong():
@@ -121,6 +146,11 @@ def test_it_runs_in_a_thread_and_nodes_made_from_a_declaration(here):
             duration='200ms'))
     assert not result.in_time and len(result.warnings) == 1
     assert result.to_json()['measured']['mode'] == 'sleep'
+
+
+def test_the_executor_of_a_program_may_wait_for_its_threads(here):
+    """Kilted's MultiThreadedExecutor has this argument."""
+    assert run(RunOptions(nodes=[waits_for_its_threads])).status == 3
 
 
 def test_what_a_node_raises_has_the_result_with_it(here):

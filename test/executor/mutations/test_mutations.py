@@ -374,10 +374,17 @@ awaiting.named(
             for delivery in deliveries:""")], of(
         'test_delivery.py', 'test_a_publication_that_fails_leaves_no_subscription_deaf')),
     Case('publications_of_another_executor_have_jobs_here', [(
-        'executor/publishing.py', 'if running is None or running.pool is not pool:',
-        'if running is None:')], of(
+        'executor/publishing.py', 'if of is not pool:', 'if of is None:')], of(
         'test_other_processes.py',
         'test_without_a_stamp_a_message_of_another_executor_has_no_job')),
+    Case('threads_publish_for_executions_that_have_ended', [(
+        'executor/starters.py', 'if work.x < 0 or topic', 'if topic')], of(
+        'test_starters.py',
+        'test_what_is_published_otherwise_belongs_to_no_job_and_is_named[a_thread_that_goes_on]')),
+    Case('threads_of_pools_publish_for_the_one_that_made_them', [(
+        'executor/starters.py', 'if not _calling.is_submitting and', 'if')], of(
+        'test_starters.py',
+        'test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it')),
     Case('calls_keep_their_worker', [(
         'executor/publishing.py', "with running.lend(f'service {service_name(self)}'):",
         'if True:')], of(

@@ -1,0 +1,375 @@
+# Copyright 2026 The mddag_executor developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+What publishes for a callback: threads, tasks, later pieces of coroutines, other callbacks.
+
+It belongs to the execution if that has not ended; else a line says so: see ``starters``.
+"""
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+import inspect
+import threading
+
+from mddag_executor import replay
+from mddag_executor.executor import current_job
+from mddag_executor.executor.watch import Watch
+from msg_graph import loads
+import pytest
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle import LifecycleNode
+from rclpy.task import Future
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from .conftest import is_idle, matched, Spinning, wait_for
+from .declared import graph
+
+GRAPH = graph(
+    detector='name: detect, subscription: /image, period: 20ms, sporadic: true, '
+             'may_publish: [/alarm], dag: main',
+    brake='name: stop, subscription: /alarm, deadline: 60s')
+ALWAYS = GRAPH.replace('may_publish', 'publishes').replace('60s', '1ms')
+IMAGES = 6
+
+
+class Detector:
+    """
+    A node that publishes an alarm for every second image, and one that gets it.
+
+    :param publish: how it does so: a function or coroutine function, which gets this object and
+        the message.
+    :ivar may_go_on: to be set when the execution has ended.
+    """
+
+    def __init__(self, make_executor, make_node, publish, text=GRAPH, node=None, **more):
+        self.task_set, self._publish = loads(text), publish
+        self.node, brake = node or make_node('detector'), make_node('brake')
+        self.group = ReentrantCallbackGroup()
+        run = self._await if inspect.iscoroutinefunction(publish) else self._call
+        self.node.create_subscription(Header, '/image', run, 10, callback_group=self.group)
+        self.publisher = self.node.create_publisher(Header, '/alarm', 10)
+        brake.create_subscription(Header, '/alarm', self._stop, 10)
+        self.images = make_node('camera').create_publisher(Header, '/image', 10)
+        self.executor = make_executor(
+            self.task_set, num_workers=4, nodes=[self.node, brake], **more)
+        self.watch = Watch(self.executor, self.task_set)
+        self.ended, self.stopped, self.kept = [], [], []
+        self.may_go_on = threading.Event()
+        self.pool = ThreadPoolExecutor(1)
+
+    def alarm(self, message):
+        self.publisher.publish(message)
+
+    def alarm_later(self, message):
+        assert self.may_go_on.wait(60.0)
+        self.alarm(message)
+
+    def _call(self, message):
+        if int(message.frame_id) % 2:
+            self._publish(self, message)
+        self.ended.append(message)
+
+    async def _await(self, message):
+        if int(message.frame_id) % 2:
+            await self._publish(self, message)
+        self.ended.append(message)
+
+    def _stop(self, message):
+        job = current_job()
+        self.stopped.append((int(message.frame_id), None if job is None else job.job))
+
+    def sink(self):
+        return self.executor.statistics()['dags']['main']['sinks']['/brake:stop']
+
+    def run(self, n_stopped=IMAGES // 2):
+        """Run it with some images; return what differs from the declaration."""
+        with Spinning(self.executor):
+            matched(self.images, self.publisher)
+            for number in range(IMAGES):
+                self._run_once(number, min(n_stopped, (number + 1) // 2))
+            assert wait_for(lambda: is_idle(self.executor))
+        self.pool.shutdown()
+        return self.watch.drift(self.executor.statistics())
+
+    def _run_once(self, number, n_stopped):
+        self.may_go_on.clear()
+        self.images.publish(Header(frame_id=str(number)))
+        assert wait_for(lambda: self.n_ran() == number + 1)
+        self.may_go_on.set()
+        assert wait_for(lambda: len(self.stopped) >= n_stopped)
+
+    def n_ran(self):
+        return self.executor.statistics()['callbacks'].get('/detector:detect', {'ran': 0})['ran']
+
+
+def counts(dags):
+    """Return how many results of the brake were in time, not due, and missed."""
+    sink = dags['main']['sinks']['/brake:stop']
+    return (sink['completed'] - sink['late'], sink.get('not_due', 0),
+            sink['late'] + sink['expired'] + sink['failed'])
+
+
+# --- in time: the callback waits for it ----------------------------------------------------------
+
+async def in_a_later_piece(each, message):
+    future = Future(executor=each.executor)
+    each.executor.create_task(future.set_result, None)
+    await future
+    each.alarm(message)
+
+
+async def after_a_sleep_of_asyncio(each, message):
+    await asyncio.sleep(0.001)
+    each.alarm(message)
+
+
+async def run_in_executor(each, message):
+    await asyncio.get_running_loop().run_in_executor(None, each.alarm, message)
+
+
+async def to_thread(each, message):
+    await asyncio.to_thread(each.alarm, message)
+
+
+async def a_task_of_asyncio(each, message):
+    async def publish():
+        await asyncio.sleep(0.001)
+        each.alarm(message)
+    await asyncio.gather(publish(), asyncio.create_task(asyncio.sleep(0)))
+
+
+async def a_thread_of_a_task_of_asyncio(each, message):
+    await asyncio.create_task(run_in_executor(each, message))
+
+
+async def a_task(each, message):
+    await each.executor.create_task(each.alarm, message)
+
+
+async def a_task_of_a_task(each, message):
+    async def publish():
+        await asyncio.sleep(0)
+        await each.executor.create_task(each.alarm, message)
+    await each.executor.create_task(publish)
+
+
+async def a_done_callback_of_a_future(each, message):
+    future, done = Future(executor=each.executor), Future(executor=each.executor)
+
+    def publish(_):
+        each.alarm(message)
+        done.set_result(None)
+    future.add_done_callback(publish)
+    future.set_result(None)
+    await done
+
+
+def a_thread(each, message):
+    thread = threading.Thread(target=each.alarm, args=(message,))
+    thread.start()
+    thread.join()
+
+
+def a_thread_of_a_thread(each, message):
+    thread = threading.Thread(target=a_thread, args=(each, message))
+    thread.start()
+    thread.join()
+
+
+def a_timer_of_threading(each, message):
+    timer = threading.Timer(0.001, each.alarm, (message,))
+    timer.start()
+    timer.join()
+
+
+def a_pool_of_threads(each, message):
+    each.pool.submit(each.alarm, message).result()
+
+
+def a_map_over_threads(each, message):
+    with ThreadPoolExecutor(2) as pool:
+        for _ in pool.map(lambda publish: publish and each.alarm(message), [False, True, False]):
+            pass
+
+
+def a_loop_over_a_generator(each, message):
+    for made in (Header(frame_id=message.frame_id) for _ in range(1)):
+        each.alarm(made)
+
+
+IN_TIME = [
+    in_a_later_piece, after_a_sleep_of_asyncio, run_in_executor, to_thread, a_task_of_asyncio,
+    a_thread_of_a_task_of_asyncio, a_task, a_task_of_a_task, a_done_callback_of_a_future, a_thread,
+    a_thread_of_a_thread, a_timer_of_threading, a_pool_of_threads, a_map_over_threads,
+    a_loop_over_a_generator]
+
+
+@pytest.mark.parametrize('publish', IN_TIME)
+def test_what_a_callback_waits_for_publishes_for_it(make_executor, make_node, tmp_path, publish):
+    """Live and in the replay; nothing differs from the declaration."""
+    path = tmp_path / 'run.mcap'
+    each = Detector(make_executor, make_node, publish, trace=str(path))
+    assert each.run() == []
+    statistics = each.executor.statistics()
+    assert counts(statistics['dags']) == (IMAGES // 2, IMAGES // 2, 0)
+    assert statistics['callbacks']['/brake:stop']['unattributed'] == 0
+    assert each.stopped == [(number, number) for number in range(1, IMAGES, 2)]
+    recorded = replay(path)
+    assert counts(recorded.result()['dags']) == (IMAGES // 2, IMAGES // 2, 0)
+    assert recorded.drift() == []
+
+
+# --- too late, or not for it ---------------------------------------------------------------------
+
+def a_thread_that_goes_on(each, message):
+    threading.Thread(target=each.alarm_later, args=(message,)).start()
+
+
+def a_pool_that_goes_on(each, message):
+    each.pool.submit(each.alarm_later, message)
+
+
+async def a_task_of_asyncio_that_goes_on(each, message):
+    async def publish():
+        await asyncio.to_thread(each.may_go_on.wait, 60.0)
+        each.alarm(message)
+    each.kept.append(asyncio.create_task(publish()))
+
+
+def a_task_that_goes_on(each, message):
+    each.executor.create_task(each.alarm_later, message)
+
+
+def a_response(each, message):
+    def on_response(_):
+        each.alarm_later(message)
+    each.client.call_async(Trigger.Request()).add_done_callback(on_response)
+
+
+def a_service(each, message):
+    each.kept.append(message)
+    each.client.call_async(Trigger.Request())
+
+
+def a_timer_of_the_node(each, message):
+    def publish():
+        timer.destroy()
+        each.alarm_later(message)
+    timer = each.node.create_timer(0.001, publish, callback_group=each.group)
+
+
+TOO_LATE = {
+    a_thread_that_goes_on: 'threads of its own', a_pool_that_goes_on: 'threads of its own',
+    a_task_of_asyncio_that_goes_on: 'threads of its own',
+    a_task_that_goes_on: 'alarm_later', a_response: 'on_response',
+    a_service: 'service /answer', a_timer_of_the_node: '/detector: publish (timer 1ms)'}
+
+
+def serving(each, publish):
+    """Let the node have a service with a client; return the executor's service callback."""
+    def answer(request, response):
+        if publish is a_service:
+            each.alarm_later(each.kept.pop())
+        return response
+    each.node.create_service(Trigger, '/answer', answer, callback_group=each.group)
+    each.client = each.node.create_client(Trigger, '/answer', callback_group=each.group)
+
+
+@pytest.mark.parametrize('publish', TOO_LATE)
+def test_what_is_published_otherwise_belongs_to_no_job_and_is_named(
+        make_executor, make_node, tmp_path, publish, capfd):
+    """The results are not due; the log, the run and its replay say where messages came from."""
+    path = tmp_path / 'run.mcap'
+    each = Detector(make_executor, make_node, publish, trace=str(path))
+    serving(each, publish)
+    found, = each.run()
+    statistics = each.executor.statistics()
+    assert counts(statistics['dags']) == (0, IMAGES, 0)
+    assert statistics['callbacks']['/brake:stop']['unattributed'] == IMAGES // 2
+    recorded = replay(path)
+    assert counts(recorded.result()['dags']) == (0, IMAGES, 0)
+    for drift in (found, *recorded.drift()):
+        assert (drift.kind, drift.callback, drift.topic, drift.observed) == (
+            'published outside', '/detector:detect', '/alarm', IMAGES // 2)
+        assert TOO_LATE[publish] in drift.text and 'are not due' in drift.text
+    assert len(recorded.drift()) == 1
+    err = capfd.readouterr().err
+    assert err.count('/detector published 1 message on /alarm in ') == 1
+
+
+def test_results_that_are_due_are_missed_which_is_no_warning(
+        make_executor, make_node, capfd):
+    """The line says so, and the table has the misses."""
+    each = Detector(make_executor, make_node, a_thread_that_goes_on, ALWAYS)
+    found, = each.run()
+    assert 'are missed' in found.text
+    statistics = each.executor.statistics()
+    sink = statistics['dags']['main']['sinks']['/brake:stop']
+    assert statistics['deadline_missed'] and 'not_due' not in sink
+    assert 'published' not in capfd.readouterr().err
+
+
+def test_what_starts_nothing_or_is_of_another_node_is_not_named(make_executor, make_node):
+    def publish(each, message):
+        each.alarm(message)
+        for publisher in each.kept:
+            thread = threading.Thread(target=publisher.publish, args=(message,))
+            thread.start()
+
+    each = Detector(make_executor, make_node, publish, GRAPH.replace(
+        'may_publish: [/alarm]', 'may_publish: [/alarm, /info]'))
+    each.kept = [each.node.create_publisher(Header, '/info', 10),
+                 make_node('foreign').create_publisher(Header, '/alarm', 10)]
+    assert each.run(n_stopped=IMAGES) == []
+
+
+def test_two_alarms_of_one_execution_make_one_result(make_executor, make_node):
+    def publish(each, message):
+        each.alarm(message)
+        each.alarm(message)
+
+    each = Detector(make_executor, make_node, publish)
+    assert each.run(n_stopped=IMAGES) == []
+    assert counts(each.executor.statistics()['dags']) == (IMAGES // 2, IMAGES // 2, 0)
+
+
+@pytest.mark.parametrize('is_active', [True, False])
+def test_a_lifecycle_node_publishes_only_while_it_is_active(
+        make_executor, make_node, ros_context, is_active):
+    node = LifecycleNode('detector', context=ros_context, enable_communication_interface=False)
+    each = Detector(
+        make_executor, make_node, lambda each, message: each.alarm(message), node=node)
+    each.publisher = node.create_lifecycle_publisher(Header, '/alarm', 10)
+    node.trigger_configure()
+    if is_active:
+        node.trigger_activate()
+    n = IMAGES // 2 if is_active else 0
+    assert each.run(n_stopped=n) == []
+    assert counts(each.executor.statistics()['dags']) == (n, IMAGES - n, 0)
+    node.destroy_node()
+
+
+def test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it(make_executor, make_node):
+    """Others submit functions as well, while the execution still runs."""
+    has_made, has_published = threading.Semaphore(0), threading.Semaphore(0)
+
+    def publish(each, message):
+        each.pool.submit(int).result()
+        each.kept.append(message)
+        has_made.release()
+        assert has_published.acquire(timeout=60.0)
+
+    def submit():
+        for _ in range(IMAGES // 2):
+            assert has_made.acquire(timeout=60.0)
+            each.pool.submit(each.alarm, each.kept.pop()).result()
+            has_published.release()
+
+    each = Detector(make_executor, make_node, publish)
+    thread = threading.Thread(target=submit)
+    thread.start()
+    found, = each.run()
+    thread.join()
+    assert 'threads of its own' in found.text
+    assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
