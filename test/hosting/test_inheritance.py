@@ -46,7 +46,7 @@ def test_a_service_of_another_program_goes_before_what_is_less_urgent(here, serv
     """Its callback group, and that of its program's executor, may be busy for one callback."""
     result = run(RunOptions(
         nodes=['asks:Control', f'asks:{serving}', 'asks:Working'], graph=loads(GRAPH),
-        duration='2s', diagnostics=None, trace='run.mcap'))
+        duration='60s', diagnostics=None, trace='run.mcap'))
     assert result.error is None
     recording = open_recording('run.mcap')
     asked = runs_of(recording, ASK)
@@ -68,11 +68,11 @@ def test_requests_of_another_process_inherit_nothing(here):
     """They are answered all the same."""
     result = run(RunOptions(
         nodes=['up=asks:Control', 'up=asks:Working', 'down=asks:spins'],
-        graph=loads(TWO_PROCESSES), duration='2s', diagnostics=None, trace='run/'))
+        graph=loads(TWO_PROCESSES), duration='60s', diagnostics=None, trace='run/'))
     assert result.error is None
     down = open_recording('run/down.mcap')
     asked = runs_of(down, ASK)
-    assert len(asked) > 5
+    assert len(asked) >= 20
     for recording in (down, open_recording('run/up.mcap')):
         inherits = recording.executions['inherited'] > 0
         assert not inherits.any()

@@ -10,14 +10,19 @@ from rclpy.node import Node
 from std_msgs.msg import Empty
 from std_srvs.srv import Trigger
 
-WORKS = 3
+WORKS, ENOUGH = 3, 20
 
 
 class Control(Node):
-    """It awaits a service in each of its periods, after it has made work for others."""
+    """
+    It awaits a service in each of its periods, after it has made work for others.
+
+    When it has had enough answers, it ends the run.
+    """
 
     def __init__(self):
         super().__init__('control')
+        self.n_answers = 0
         self.work = self.create_publisher(Empty, '/work', 50)
         self.client = self.create_client(Trigger, '/ask')
         self.create_timer(0.05, self.tick)
@@ -27,6 +32,9 @@ class Control(Node):
             for _ in range(WORKS):
                 self.work.publish(Empty())
             assert (await self.client.call_async(Trigger.Request())).message == 'answer'
+            self.n_answers += 1
+            if self.n_answers == ENOUGH:
+                rclpy.shutdown()
 
 
 class Serving(Node):
