@@ -8,7 +8,7 @@ Theory of operation
 1.  A message belongs to a job if an execution of the job published it, or code that works on its
     behalf (``starters``).  A message that a thread, a task or an undeclared callback publishes
     otherwise belongs to no job.  The job counts as without it, although the node has published.
-2.  Such messages are counted by publisher and by what has published.  Drift reports them at the
+2.  Such messages are counted by publisher, and by the code that publishes.  Drift reports them at the
     end of the run (``msg_graph.drift``, rule 7), and a recorded run has them.
 3.  If a callback may publish the topic (``may_publish``), results are not due without the message,
     and are not judged.  Nothing else shows this during a run, so it is also logged, once.
@@ -26,7 +26,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.logging import get_logger
 
 Outsiders = tuple[tuple[str, str, str, int], ...]
-"""Node, topic, what has published (empty: no callback), and the number of messages."""
+"""Node, topic, callback or task (empty: none), and the number of its messages."""
 
 
 class Outside:
@@ -41,7 +41,7 @@ class Outside:
     ) -> None:
         self._task_set = task_set
         self._nodes_now = nodes
-        # by the address of the publisher: by what has published, its node, and its topic
+        # by the address of the publisher: the counts by callback or task, its node, and its topic
         self._counts: dict[int, dict[str, int]] = {}
         self._nodes: dict[int, str] = {}
         self._topics: dict[int, str] = {}

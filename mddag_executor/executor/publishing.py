@@ -177,7 +177,7 @@ def watch(pool: Any) -> None:
 
 
 def unwatch(pool: Any) -> None:
-    """End ``watch``, also for executors that have been destroyed."""
+    """End ``watch`` for a pool, and for pools that have been destroyed."""
     with _lock:
         for topic, several in list(_watching.items()):
             rest = tuple(each for each in several if each() not in (None, pool))
