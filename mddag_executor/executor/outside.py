@@ -8,8 +8,8 @@ Theory of operation
 1.  A message belongs to a job if an execution of the job published it, or code that works on its
     behalf (``starters``).  A message that a thread, a task or an undeclared callback publishes
     otherwise belongs to no job.  The job counts as without it, although the node has published.
-2.  Such messages are counted by publisher, and by the code that publishes.  Drift reports them at the
-    end of the run (``msg_graph.drift``, rule 7), and a recorded run has them.
+2.  Such messages are counted by publisher, and by the code that publishes.  Drift reports them at
+    the end of the run (``msg_graph.drift``, rule 6), and a recorded run has them.
 3.  If a callback may publish the topic (``may_publish``), results are not due without the message,
     and are not judged.  Nothing else shows this during a run, so it is also logged, once.
 """
