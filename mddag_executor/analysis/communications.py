@@ -36,7 +36,7 @@ def communications(recording: Recording) -> list[Communication]:
     table, messages = recording.executions, recording.publications
     found: list[Communication] = []
     started = np.flatnonzero(table['message'] >= 0)
-    message = messages[table['message'][started]]
+    message = messages[['publisher', 'time']][table['message'][started]]
     known = (message['publisher'] >= 0) & (message['time'] > 0)
     started, message = started[known], message[known]
     publishers, publisher_of = different(message['publisher'])

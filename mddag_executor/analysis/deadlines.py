@@ -33,7 +33,7 @@ from collections import Counter
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from mddag_executor.core import NEVER, Scheduler, Tables, Tally
+from mddag_executor.core import NEVER, Tables, Tally
 from mddag_executor.core.state import (
     ABORTED,
     COMPLETED,
@@ -366,6 +366,7 @@ class Judged:
                    if of == dag]
         if not changes:
             return None
+        from mddag_executor.core import Scheduler
         first, last = self.tables.first_vertex[dag:dag + 2]
         scheduler = Scheduler(self.tables, 1)
         expected = np.full(jobs.done.shape, HERE)

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 from mddag_executor.cli import common, options
 from mddag_executor.cli.text import Progress
 from mddag_executor.errors import UsageError
-from mddag_executor.hosting.run_options import number_of_processes
 
 if TYPE_CHECKING:
     from mddag_executor.analysis.as_recorded import Replay
@@ -51,6 +50,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add(group, '--execution-times', '--seed', only='of an ordinary bag: ', default=None)
 
 
+def _number_of_processes(args: argparse.Namespace) -> int | None:
+    """Return the number that `--processes` gives; None: none is given, or a file is."""
+    if args.processes is None:
+        return None
+    from mddag_executor.hosting.run_options import number_of_processes
+    return number_of_processes(args.processes)
+
+
 def _overheads(text: str) -> int | None:
     """Return the overhead of each dispatch in ns, None for that of the recording."""
     if text == 'recorded':
@@ -60,7 +67,7 @@ def _overheads(text: str) -> int | None:
 
 def check(args: argparse.Namespace) -> None:
     """Check the options that depend on each other."""
-    number_of_processes(args.processes)
+    _number_of_processes(args)
     if args.reschedule:
         if args.end is not None:
             raise UsageError('--to: the scheduler runs to the end of a recording: leave it or '
@@ -202,7 +209,7 @@ def _processes(
 ) -> Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None:
     """Return a function that says which node runs in which process, as `--processes` says."""
     from msg_graph.edit import load_processes
-    count = number_of_processes(args.processes)
+    count = _number_of_processes(args)
     if args.processes is None:
         return None
     if count is not None:

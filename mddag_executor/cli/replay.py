@@ -67,7 +67,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
-    from mddag_executor.report.diff import compare_requirements, compare_sinks, sinks_table
     from mddag_executor.report.replays import (
         recorded_tables,
         summary,
@@ -80,6 +79,7 @@ def _lines(args: argparse.Namespace, result: dict[str, Any]) -> Iterator[str]:
         yield ('transport, dispatch and other load are not in a bag: they are left out '
                '(--overheads)')
     elif result['rescheduled']:
+        from mddag_executor.report.diff import compare_requirements, compare_sinks, sinks_table
         yield 'The recording (A) and the same rescheduled (B):'
         yield sinks_table(compare_sinks(result['recorded']['dags'], result['dags']))
         if result.get('requirements'):

@@ -361,6 +361,10 @@ def number_pieces(table: Table, mine: Ints, of: str, goes_on: Mask) -> None:
     :param goes_on: by row of ``mine`` whether another piece may follow.
     """
     columns = [table[name][mine] for name in (of, 'vertex', 'ready')]
+    order = sort_by(columns[0])
+    group, ready = columns[0][order], columns[2][order]
+    if ((group[1:] != group[:-1]) | (ready[1:] > ready[:-1])).all():
+        return      # in the order of the table each was ready later than the one before
     order = sort_by(*columns, table['start'][mine])
     mine = mine[order]
     same = np.zeros(len(mine), dtype=np.bool_)

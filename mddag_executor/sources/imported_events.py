@@ -32,6 +32,7 @@ ADDRESSES = 2 ** 64
 
 (START, END, INTRA, RCLCPP, RCL, DDS_WRITE, BECAME, BIND, RMW_PUBLISH, DISPATCH, TAKE, WITHIN,
  COPY, ENQUEUE, DEQUEUE, LOST, SHUTDOWN) = range(17)
+LAST_KIND = SHUTDOWN
 
 KINDS: dict[str, tuple[Any, ...]] = {
     'ros2_caret:dds_write': (DDS_WRITE, 'message', 'timestamp_'),
@@ -72,8 +73,10 @@ _TIMES = ('init_timestamp', 'ready', 'start')
 """The fields of other events that are times: of a timer's initialisation, of `unfinished`."""
 _COLUMNS_OF_TIMES = {START: ('b', 'c'), SHUTDOWN: ('a',)}
 """By kind of event its columns that are times, 0: unknown; LTTng's starts have none."""
-_EVENT = np.dtype([('time', 'i8'), ('place', 'i8'), ('thread', 'i8'), ('kind', 'i1'),
+_EVENT = np.dtype([('time', 'i8'), ('place', 'i8'), ('thread', 'i4'), ('kind', 'i1'),
                    ('a', 'i8'), ('b', 'i8'), ('c', 'i8'), ('d', 'i8')])
+_OfKind = tuple[Any, Ints, tuple[Any, ...]]
+"""Events of one kind: a structured array, their positions in the file, and the kind."""
 
 
 class Events(NamedTuple):
@@ -162,18 +165,20 @@ def read_events(
     """
     heard = () if listener is None else listener.names
     parts: list[Table] = [rows(_EVENT)]
+    thread_numbers: dict[int, int] = {}     # by process and thread id
     tuples: list[tuple[int, Event]] = []
     names_of: dict[tuple[int, int], str] = {}
     count = 0
     for batch in reader.batches(
             {*kinds, *others, *heard, *BEFORE_HUMBLE, PROCESS}, as_table=False):
+        some: list[_OfKind] = []
         for head, table, places in batch.tables:
             if head[0].name in BEFORE_HUMBLE:
                 raise TraceError(reader.path, BEFORE_HUMBLE_PROBLEM, BEFORE_HUMBLE_REMEDY)
             if listener is not None and head[0].name in heard:
                 listener.take(head[0].name, table, places)
             if head[0].name in kinds:
-                parts.append(_normal(table, places, kinds[head[0].name]))
+                some.append((table, places, kinds[head[0].name]))
             elif head[0].name in heard:
                 continue
             if head[0].name not in kinds or head[0].name in others:
@@ -192,20 +197,23 @@ def read_events(
                 row = np.zeros(1, [(name, 'i8') for name in numbers])
                 for name, value in numbers.items():
                     row[name] = (value + ADDRESSES // 2) % ADDRESSES - ADDRESSES // 2
-                parts.append(_normal(row, np.array([place]), kinds[layout.name]))
+                some.append((row, np.array([place]), kinds[layout.name]))
             if layout.name not in kinds or layout.name in others:
                 tuples.append((place, event))
+        if some:
+            parts.append(_in_order(some, thread_numbers))
         count += batch.n_events
         if progress is not None:
             progress(count)
-    table = _in_order(parts)
+    table = _joined(parts)
     tuples.sort(key=lambda each: (each[1][1], each[0]))
     possible = (table['time'] >= 0) & (table['time'] < NEVER)
     kept = [event for _, event in tuples if 0 <= event[1] < NEVER]
     impossible = table['time'][~possible].tolist() + [
         event[1] for _, event in tuples if not 0 <= event[1] < NEVER]
-    threads, which = different(table['thread'])
-    table.replace('thread', which)
+    threads = np.array([*thread_numbers], dtype=np.int64)
+    in_order = sort_by(threads)
+    table.replace('thread', np.argsort(in_order).astype(np.int32)[table['thread']])
     warning = '' if not impossible else (
         f'left out: {counted(len(impossible), "event")} at an impossible time, the first at '
         f'{impossible[0]} ns')
@@ -213,34 +221,53 @@ def read_events(
         table = table[possible]
     return Events(
         table, [(each >> 32, (each & 0xFFFFFFFF) - (each & 0x80000000) * 2)
-                          for each in threads.tolist()], kept, warning, names_of)
+                for each in threads[in_order].tolist()], kept, warning, names_of)
 
 
-def _in_order(parts: list[Table]) -> Table:
-    """Return tables as one, in the order of time and file; empties the list to save memory."""
+def _in_order(some: list[_OfKind], threads: dict[int, int]) -> Table:
+    """
+    Return the events of a batch as rows of the table, in the order of time and file.
+
+    :param threads: receives the threads: process and thread id as one number.
+    """
+    place = np.concatenate([places for _, places, _ in some])
+    found, begin = rows(_EVENT, len(place), place=place), 0
+    for events, places, kind in some:
+        _fill(found[begin:begin + len(places)], events, kind, threads)
+        begin += len(places)
+    return found[sort_by(found['time'], place)]
+
+
+def _joined(parts: list[Table]) -> Table:
+    """Return the rows of batches in the order of time and file; empties the list."""
     columns = {name: [each[name] for each in parts] for name in parts[0].names}
     parts.clear()
-    time, place = (np.concatenate(columns.pop(name)) for name in ('time', 'place'))
-    order = sort_by(time, place)
-    found = {'time': time[order], 'place': place[order]}
-    del time, place
+    found = {'time': np.concatenate(columns.pop('time'))}
+    order = sort_by(found['time'])
+    places = np.flatnonzero(order != np.arange(len(order)))     # few: batches hardly overlap
+    order = order[places]
+    found['time'][places] = found['time'][order]
     for name in _EVENT.names or ():
         if name in columns:
-            found[name] = np.concatenate(columns.pop(name))[order]
+            found[name] = np.concatenate(columns.pop(name))
+            found[name][places] = found[name][order]
     return Table(found)
 
 
-def _normal(events: Any, places: Ints, kind: tuple[Any, ...]) -> Table:
-    """Return events of one kind as rows of the table; missing fields are 0."""
-    found = rows(_EVENT, len(events))
-    found['time'], found['place'], found['kind'] = events['timestamp'], places, kind[0]
-    found['thread'] = (events['vpid'].astype(np.int64) << 32) | (
-        events['vtid'].astype(np.int64) & 0xFFFFFFFF)
+def _fill(
+    found: Table, events: Any, kind: tuple[Any, ...], threads: dict[int, int]
+) -> None:
+    """Fill rows with events of one kind; missing fields are 0."""
+    names = events.dtype.names or ()
+    found['time'], found['kind'] = events['timestamp'], kind[0]
+    numbers, which = different(
+        (events['vpid'].astype(np.int64) << 32) | (events['vtid'].astype(np.int64) & 0xFFFFFFFF))
+    found['thread'] = np.array([
+        threads.setdefault(each, len(threads)) for each in numbers.tolist()])[which]
     for name, fields in zip('abcd', kind[1:]):
         for field in reversed(fields.split()):
-            if field in (events.dtype.names or ()):
-                value = events[field].astype(np.int64)
-                found[name] = np.where(value != 0, value, found[name])
-    if kind[0] == START and 'cpu_time' in (events.dtype.names or ()):
+            if field in names:
+                value = events[field]
+                np.copyto(found[name], value, casting='unsafe', where=value != 0)
+    if kind[0] == START and 'cpu_time' in names:
         found['d'] = 2 * (events['cpu_time'] + 1) + (events['held_interpreter'] != 0)
-    return found

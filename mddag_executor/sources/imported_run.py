@@ -197,9 +197,11 @@ class ImportedRun:
         """
         events, runs = self._events.table, self.links.runs
         pids = np.array([pid for pid, _ in self._events.threads], dtype=np.int64)
-        ends = np.zeros(len(events), dtype=np.int64)    # by process its last event
+        last_events = np.zeros(len(pids), dtype=np.int64)
+        last_events[events['thread']] = events['time']      # the last one is written last
+        ends = np.zeros(len(pids), dtype=np.int64)      # by process
         _, process = different(pids)
-        np.maximum.at(ends, process[events['thread']], events['time'])
+        np.maximum.at(ends, process, last_events)
         at = np.flatnonzero(events['kind'] <= END)
         last = np.full(len(pids), UNKNOWN)      # by thread its last start or end
         last[events['thread'][at]] = at
@@ -235,10 +237,11 @@ class ImportedRun:
     def _executions(self) -> Table:
         """Return the executions, without jobs."""
         runs, events = self.links.runs, self._events
-        ended = np.flatnonzero(runs['end_at'] >= 0)
-        ended = ended[sort_by(runs['end_at'][ended])]
-        threads, first = np.unique(runs['thread'][ended], return_index=True)
-        threads = threads[sort_by(first)]
+        ended = runs['end_at'] >= 0
+        # workers are numbered by their first execution that ended
+        first = np.full(len(events.threads), NEVER)
+        np.minimum.at(first, runs['thread'][ended], runs['end_at'][ended])
+        threads = sort_by(first)[:int((first < NEVER).sum())]
         worker = np.full(len(events.threads), UNKNOWN)
         worker[threads] = np.arange(len(threads))
         self._workers = [events.threads[each] for each in threads.tolist()]
@@ -248,9 +251,8 @@ class ImportedRun:
             thread=_values([tid for _, tid in events.threads], runs['thread']),
             start=runs['start'], began=runs['start'], end=runs['end'], message=runs['message'],
             busy=np.where(runs['end'] >= 0, runs['end'] - runs['start'], UNKNOWN),
-            cpu=UNKNOWN, order=UNKNOWN, worker=UNKNOWN, process=self._process_of(runs),
-            due=runs['due'])
-        table['worker'][ended] = worker[runs['thread'][ended]]
+            cpu=UNKNOWN, order=UNKNOWN, worker=np.where(ended, worker[runs['thread']], UNKNOWN),
+            process=self._process_of(runs), due=runs['due'])
         return table
 
     def _process_of(self, runs: Table) -> Ints:
@@ -259,18 +261,18 @@ class ImportedRun:
 
         Threads of this executor are workers of one pool.
         """
-        pids = np.array([pid for pid, _ in self._events.threads], dtype=np.int64)[runs['thread']]
         declared = [each.number in self._vertex for each in self.links.callbacks]
         known = np.array(declared, dtype=np.bool_)[runs['callback']]
-        self._pids = list(dict.fromkeys([*distinct(pids[known]).tolist(),
-                                         *distinct(pids).tolist()]))
-        self._n_declared = len(distinct(pids[known]))
+        by_thread = [pid for pid, _ in self._events.threads]
+        of_declared, every = (
+            sorted({by_thread[each] for each in distinct(threads).tolist()})
+            for threads in (runs['thread'][known], runs['thread']))
+        self._pids = list(dict.fromkeys([*of_declared, *every]))
+        self._n_declared = len(of_declared)
         if not self._imported:
             return np.zeros(len(runs), dtype=np.int64)
-        order = np.argsort(self._pids)
-        found: Ints = order[np.searchsorted(np.array(self._pids)[order], pids)] if len(
-            runs) else pids
-        return found
+        number = {pid: place for place, pid in enumerate(self._pids)}
+        return _values([number.get(pid, UNKNOWN) for pid in by_thread], runs['thread'])
 
     def _placed(self, names: Mapping[int, str]) -> list[Process]:
         """Return the nodes of each process in which declared callbacks ran, if it has several."""
@@ -347,7 +349,7 @@ class ImportedRun:
         runs, messages = self.links.runs, self.links.messages
         sent = self._stamps('stamp')
         if len(messages):
-            message = messages[runs['message']]
+            message = messages[['stamp', 'time']][runs['message']]
             published = np.where(
                 message['stamp'] != 0, message['stamp'] + self._of_sender, message['time'])
             sent = np.where((sent == 0) & (runs['message'] >= 0), published, sent)
@@ -357,6 +359,8 @@ class ImportedRun:
     @property
     def _of_sender(self) -> Ints:
         """Return by execution how the clock of the sender of its message was moved, ns."""
+        if not self.links.shift.any():
+            return np.zeros(len(self.links.runs), dtype=np.int64)
         at = self.links.messages['at']
         shift = self.links.shift[self._events.table['thread'][at]]
         found: Ints = np.append(shift, 0)[self.links.runs['message']]

@@ -158,9 +158,36 @@ class JoinedJobs:
                 mine = piece[(self._place[piece] == place) & self._stated[piece]]
                 self._release[mine] += shift - each.shift
 
+    def _find_clear(self, rows: Ints) -> bool:
+        """
+        Find the jobs of releases by the times only, if these are clear; return whether they are.
+
+        They are clear if groups of releases are farther apart than ``SAME_RELEASE``, a group has
+        at most one release of each process, and groups were first seen in the order of time.
+        """
+        release, place = self._release[rows], self._place[rows]
+        in_time = sort_by(release)
+        times = release[in_time]
+        begins = np.flatnonzero(np.append(True, np.diff(times) > SAME_RELEASE)[:len(rows)])
+        until = np.append(begins[1:], len(rows))
+        job = np.empty(len(rows), dtype=np.int64)
+        job[in_time] = np.repeat(np.arange(len(begins)), until - begins)
+        first = np.empty(len(begins), dtype=np.int64)
+        first[job[::-1]] = np.arange(len(rows))[::-1]       # the first one is written last
+        pairs = np.sort(job * len(self._processes) + place)
+        if ((times[until - 1] - times[begins] > SAME_RELEASE).any()
+                or (pairs[1:] == pairs[:-1]).any() or (np.diff(first) < 0).any()
+                or (np.maximum.accumulate(job) - job >= _KEPT).any()):
+            return False
+        self._number[rows] = job
+        self._is_first[rows[first]] = True
+        return True
+
     def _find(self, dag: Dag, rows: Ints) -> None:
         """Find the job of each release (rule 3)."""
         stamped = dag.release_from == 'header_stamp'
+        if not len(rows) or (not stamped and self._find_clear(rows)):
+            return
         far = max(dag.period_ns, SAME_RELEASE)
         releases: list[int] = []        # of the jobs so far
         seen: list[int] = []            # by job the processes that have released it, as bits

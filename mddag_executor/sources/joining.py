@@ -39,7 +39,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.errors import UsageError
 from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.head import Head, is_declared, ReplayError
-from mddag_executor.recording.joins import different, groups, RowNumbers, sort_by
+from mddag_executor.recording.joins import different, RowNumbers, sort_by
 from mddag_executor.recording.losses import Loss, Losses
 from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.recording import Recording
@@ -186,7 +186,8 @@ class _Part:
         is_open[ended[ended >= 0]] = False
         self.open_jobs = list(zip(
             releases['dag'][is_open].tolist(), self.number[is_open].tolist()))
-        self._note_ran(table[(row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)])
+        started = (row >= 0) & (table['vertex'] >= 0) & (table['start'] >= 0)
+        self._note_ran(table, started, len(legs))
         known = row >= 0
         table['job'][known] = self.number[row[known]]
         for name in ('job_ends', 'misses', 'demotions'):
@@ -198,18 +199,20 @@ class _Part:
         row = rows[jobs.places_of(dag_of[drops['vertex']], drops['job'])]
         drops['job'] = np.append(self.number, UNKNOWN)[row]
         new = RowNumbers(kept)
-        tables['executions'] = tables['executions'][kept]
+        if not kept.all():
+            tables['executions'] = tables['executions'][kept]
         releases['job'] = self.number
         tables['releases'] = releases[self.is_first]
         return new
 
-    def _note_ran(self, started: Table) -> None:
-        """Note the first and last execution of vertices."""
-        started = started[sort_by(started['vertex'], started['start'])]
-        ran = [(int(started['start'][begin]), int(started['vertex'][begin]),
-                int(started['start'][until - 1]))
-               for begin, until in zip(*groups(started['vertex']))]
-        self.ran = {vertex: (first, last) for first, vertex, last in sorted(ran)}
+    def _note_ran(self, table: Table, started: Mask, n_vertices: int) -> None:
+        """Note the first and last execution of vertices, of those that started."""
+        vertex, start = table['vertex'][started], table['start'][started]
+        first, last = np.full(n_vertices, NEVER), np.full(n_vertices, UNKNOWN)
+        np.minimum.at(first, vertex, start)
+        np.maximum.at(last, vertex, start)
+        self.ran = {each: (int(first[each]), int(last[each]))
+                    for each in sort_by(first).tolist() if last[each] >= 0}
 
 
 class Joined:

@@ -66,6 +66,7 @@ from mddag_executor.sources.imported_events import (
     ENQUEUE,
     Events,
     INTRA,
+    LAST_KIND,
     LOST,
     RCL,
     RCLCPP,
@@ -186,10 +187,9 @@ class Links:
         # by thread, then by time
         self._order = sort_by(self.events['thread'])
         self.callbacks, self._callback = self._objects(
-            np.isin(kind, (START, END, DISPATCH, WITHIN)),
-            who.callbacks, who.callback)
+            self._are(START, END, DISPATCH, WITHIN), who.callbacks, who.callback)
         self.publishers, self._publisher = self._objects(
-            np.isin(kind, _PUBLISHES) & (self.events['a'] != 0), who.publishers)
+            self._are(*_PUBLISHES) & (self.events['a'] != 0), who.publishers)
         self.taken, self._subscription = self._objects(kind == TAKE, who.taken)
         names = ['', *(each.topic for each in self.publishers)]
         self.topics = {name: number for number, name in enumerate(dict.fromkeys(names))}
@@ -216,6 +216,13 @@ class Links:
         return [Lost(min(at, gap), -1, -1, now) for at, gap, now in zip(
             since.tolist(), gaps.tolist(), time[gaps].tolist())]
 
+    def _are(self, *kinds: int) -> Mask:
+        """Return which events are of some kinds."""
+        asked = np.zeros(LAST_KIND + 1, dtype=np.bool_)
+        asked[[*kinds]] = True
+        found: Mask = asked.take(self.events['kind'])
+        return found
+
     def _objects(
         self, events: Mask, known: Addresses[Any],
         find: Function[[int, int, int], Any] | None = None,
@@ -224,30 +231,42 @@ class Links:
         find = find or known.latest
         at = np.flatnonzero(events)
         table = self.events
-        address = table['a'][at]
-        _, process = different(self._pid)
-        addresses, key = different(address)
-        key = key + process[table['thread'][at]].astype(np.int64) * max(1, len(addresses))
-        order = sort_by(key)
-        begins = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0][:len(order)])
-        groups = sorted(np.split(order, begins[1:]), key=lambda each: each[:1].tolist())
+        pids, process = different(self._pid)
+        addresses, key = different(table['a'][at])
+        if len(pids) > 1:
+            key += process[table['thread'][at]] * np.int32(max(1, len(addresses)))
+        #: By key its first event.
+        first = np.full(len(pids) * len(addresses), -1)
+        first[key[::-1]] = at[::-1]
         objects: dict[int, int] = {}
         found: list[Any] = []
+        index_of = np.full(len(first), -1, dtype=np.int32)
         index = np.full(len(table), -1, dtype=np.int32)
-        for group in groups if len(order) else ():
-            where = (int(self._pid[table['thread'][at[group[0]]]]),
-                     int(address[group[0]]) % ADDRESSES)
-            times = table['time'][at[group]]
+        several: list[tuple[Ints, int]] = []
+        for number in sort_by(first)[int((first < 0).sum()):].tolist():
+            place, which = divmod(number, len(addresses))
+            where = int(pids[place]), int(addresses[which]) % ADDRESSES
             since = np.array(known.times(*where), dtype=np.int64)
-            piece = np.maximum(0, as_of(since, times))
-            for number in distinct(piece).tolist():
-                thing = find(*where, int(since[number]) if len(since) else int(times[0]))
+            mine, pieces = at[:0], [0]
+            if len(since) > 1:      # the address was used again
+                mine = at[key == number]
+                piece = np.maximum(0, as_of(since, table['time'][mine]))
+                pieces = distinct(piece).tolist()
+            for each in pieces:
+                thing = find(*where, int(
+                    since[each] if len(since) else table['time'][first[number]]))
                 if thing is None:
                     continue
                 if id(thing) not in objects:
                     objects[id(thing)] = len(found)
                     found.append(thing)
-                index[at[group[piece == number]]] = objects[id(thing)]
+                if len(since) > 1:
+                    several.append((mine[piece == each], objects[id(thing)]))
+                else:
+                    index_of[number] = objects[id(thing)]
+        index[at] = index_of[key]
+        for mine, each in several:
+            index[mine] = each
         return found, index
 
     def _last(self, of: Mask, before: Mask) -> Ints:
@@ -282,46 +301,84 @@ class Links:
 
     def _stack(self) -> tuple[Ints, Ints]:
         """Return the first and last event of executions."""
-        table = self.events
-        at = np.flatnonzero(table['kind'] <= END)
-        is_start = table['kind'][at] == START
-        begin, run = at[is_start], np.cumsum(is_start) - 1
+        table, kind = self.events, self.events['kind']
+        is_start = kind == START
+        begin = np.flatnonzero(is_start)
+        run = np.cumsum(is_start, dtype=np.int32) - np.int32(1)     # the last one that began
         end_at = np.full(len(begin), -1)
         #: By event of a start or end the execution that runs after it in the thread, or -1.
-        self._top = np.full(len(table), -1)
+        self._top = np.full(len(table), -1, dtype=np.int32)
         # in most threads each start is followed by the end of the same callback
-        order = sort_by(table['thread'][at])
-        thread, number, starts = (
-            each[order] for each in (table['thread'][at], self._callback[at], is_start))
-        same = np.append(False, thread[1:] == thread[:-1])[:len(at)]
-        follows = same & np.append(False, starts[:-1])[:len(at)]    # a start
+        at = self._order[(kind <= END)[self._order]]
+        thread, number, starts = (each[at] for each in (table['thread'], self._callback, is_start))
+        follows = np.append(False, (thread[1:] == thread[:-1]) & starts[:-1])[:len(at)]   # a start
         fits = np.where(starts, ~follows, follows & np.append(
             False, number[1:] == number[:-1])[:len(at)])
         simple = np.ones(len(self._pid), dtype=np.bool_)
         simple[thread[~fits]] = False
-        ends = np.flatnonzero(~starts & simple[thread])
-        end_at[run[order[ends - 1]]] = at[order[ends]]
-        begins = order[starts & simple[thread]]
-        self._top[at[begins]] = run[begins]
-        others = np.flatnonzero(~simple[table['thread'][at]])
-        self._nest(at[others], run[others], end_at)
+        is_simple = simple[thread]
+        ends = np.flatnonzero(~starts & is_simple)
+        end_at[run[at[ends - 1]]] = at[ends]
+        begins = at[starts & is_simple]
+        self._top[begins] = run[begins]
+        others = at[~is_simple]
+        self._nest(others, run[others], end_at)
         return begin, end_at
 
     def _nest(self, at: Ints, runs: Ints, end_at: Ints) -> None:
         """
         Find the ends of executions in threads with nested executions, or with events missing.
 
-        :param at: starts and ends; ``runs``: of each the last execution that started.
+        Most starts are followed by their ends.  Rows of such pairs change nothing for what runs
+        around them, unless that is one of the same callbacks.
+
+        :param at: starts and ends, by thread; ``runs``: of each the last execution that started.
         """
         table = self.events
+        thread, kind, number, time = (each[at] for each in (
+            table['thread'], table['kind'], self._callback, table['time']))
+        starts, same = kind == START, thread[1:] == thread[:-1]
+        begins_pair = np.append(
+            same & starts[:-1] & ~starts[1:] & (number[1:] == number[:-1]), False)[:len(at)]
+        ends_pair = np.append(False, begins_pair[:-1])[:len(at)]
+        end_at[runs[begins_pair]] = at[ends_pair]
+        top = np.where(begins_pair, runs, -1)
+        in_pair = begins_pair | ends_pair
+        borders = 1 + np.flatnonzero(~same | (in_pair[1:] != in_pair[:-1]))
         stacks: dict[int, list[int]] = {}
         callback: dict[int, int] = {}
         inner: dict[int, int] = {}      # last start of a nested execution
-        top: list[int] = []
-        for here, thread, kind, number, now, new in zip(at.tolist(), *(
-                each[at].tolist() for each in (
-                    table['thread'], table['kind'], self._callback, table['time'])),
-                runs.tolist()):
+        for begin, end in zip([0, *borders.tolist()], [*borders.tolist(), len(at)]):
+            part = slice(begin, end)
+            if begin < end and in_pair[begin]:
+                stack = stacks.setdefault(int(thread[begin]), [])
+                if len(stack) <= _DEEPEST and not any(
+                        (number[part] == callback[run]).any() for run in stack):
+                    if stack:
+                        inner[stack[-1]] = int(time[part][starts[part]][-1])
+                        top[part][ends_pair[part]] = stack[-1]
+                    continue
+            top[part] = list(self._follow(
+                zip(*(each[part].tolist() for each in (at, thread, kind, number, time, runs))),
+                stacks, callback, inner, end_at))
+        self._top[at] = top
+        for stack in stacks.values():
+            for run in stack:
+                if run in inner:
+                    self._without_end(len(table), callback[run], run, inner[run])
+
+    def _follow(
+        self, events: Iterable[tuple[int, ...]], stacks: dict[int, list[int]],
+        callback: dict[int, int], inner: dict[int, int], end_at: Ints,
+    ) -> Iterator[int]:
+        """
+        Follow starts and ends one by one; yield the execution that runs after each, or -1.
+
+        :param events: event, thread, kind, callback, time, last execution that started.
+        :param stacks: by thread what runs; ``callback``: by execution its callback; ``inner``: the
+            last start of an execution in it.
+        """
+        for here, thread, kind, number, now, new in events:
             fresh = thread not in stacks
             stack = stacks.setdefault(thread, [])
             known = any(callback[run] == number for run in stack)
@@ -344,12 +401,7 @@ class Links:
                 # otherwise it began before the recording
                 self.losses.count('starts', self.callbacks[number].label)
                 self._lost.append(Lost(here, number, -1, now))
-            top.append(stack[-1] if stack else -1)
-        self._top[at] = top
-        for stack in stacks.values():
-            for run in stack:
-                if run in inner:
-                    self._without_end(len(table), callback[run], run, inner[run])
+            yield stack[-1] if stack else -1
 
     def _without_end(self, at: int, callback: int, run: int, now: int) -> None:
         self.losses.count('ends', self.callbacks[callback].label)
@@ -366,14 +418,15 @@ class Links:
     def _publications(self) -> Table:
         """Return the publications (rule 2), without their source timestamps."""
         table, kinds = self.events, self.events['kind']
-        publishes = np.isin(kinds, _PUBLISHES)
+        publishes = self._are(*_PUBLISHES)
         at = np.flatnonzero(publishes)
         kind, handle, message = (table[name][at] for name in ('kind', 'a', 'b'))
         publisher = self._publisher[at]
         #: By event of a publication: its row, or -1.
-        self._row = np.full(len(table), -1)
+        self._row = np.full(len(table), -1, dtype=np.int32)
         self._row[at] = np.arange(len(at))
-        previous = self._last(publishes | (kinds <= END), publishes)
+        previous = np.full(len(at), -1) if (kind == RCLCPP).all() else self._last(
+            publishes | (kinds <= END), publishes)
         before = np.where(previous >= 0, self._row[previous], -1)   # -1: a start or end
         after = np.maximum(before, 0)
         after_intra = (kind == RCLCPP) & (before >= 0) & (kind[after] == INTRA) & (
@@ -419,9 +472,8 @@ class Links:
         :return: pairs of topic and source timestamp of several possible publications; here none.
         """
         table, found = self.events, self.messages
-        kinds = table['kind']
-        about = np.isin(kinds, (*_STAMPS, BECAME))
-        before = np.isin(kinds, _PUBLISHES) | (kinds <= END)
+        about = self._are(*_STAMPS, BECAME)
+        before = self._are(*_PUBLISHES, START, END)
         at = np.flatnonzero(about)
         kind, a, stamp = (table[name][at] for name in ('kind', 'a', 'b'))
         # the last event of a publication, unless a callback began or ended after it
@@ -456,7 +508,7 @@ class Links:
     def _arrivals(self) -> Ints:
         """Return by execution the event that says which message it processes, or -1."""
         kind = self.events['kind']
-        arrives = np.isin(kind, _ARRIVALS)
+        arrives = self._are(*_ARRIVALS)
         taken = (kind == TAKE) & (self.events['c'] != 0) & (self.events['b'] != 0)
         arrives &= (kind != TAKE) | taken
         starts = kind == START
@@ -505,7 +557,7 @@ class Links:
     def _find_messages(self) -> None:
         """Find messages by their source timestamps; count executions without one."""
         rows = np.flatnonzero(self.runs['message'] < 0)
-        runs = self.runs[rows]
+        runs = self.runs[['at', 'callback', 'start', 'stamp', 'taken']][rows]
         number, stamped = runs['callback'], runs['stamp'] != 0
         message = np.full(len(rows), _NONE)
         topic = self._numbers(each.start for each in self.callbacks)[number[stamped]]
@@ -524,13 +576,13 @@ class Links:
         """Return the message by event that dispatches or dequeues it in its process (rule 4)."""
         table = self.events
         kind = table['kind']
-        at = np.flatnonzero(np.isin(kind, (INTRA, COPY, WITHIN, ENQUEUE, DEQUEUE)))
+        at = np.flatnonzero(self._are(INTRA, COPY, WITHIN, ENQUEUE, DEQUEUE))
         found: dict[int, int] = {}
         if not len(at):
             return found
         enqueues = kind == ENQUEUE
         last = np.full(len(table), -1)
-        last[enqueues] = self._last(np.isin(kind, (*_PUBLISHES, START, END)), enqueues)
+        last[enqueues] = self._last(self._are(*_PUBLISHES, START, END), enqueues)
         started = self._last(kind <= END, kind == DEQUEUE)
         fresh = dict(zip(np.flatnonzero(kind == DEQUEUE).tolist(), (started < 0).tolist()))
         by_address: dict[tuple[int, int], int] = {}

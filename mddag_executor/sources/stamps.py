@@ -23,14 +23,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from mddag_executor.recording.columns import Ints
-from mddag_executor.recording.joins import distinct
-from mddag_executor.sources.stamps_without_numbers import (
-    BeingSent,
-    find_in_order,
-    ROUNDING_NS,
-)
+from mddag_executor.recording.columns import Ints, Mask
+from mddag_executor.recording.joins import different, rows_by
+from mddag_executor.sources.stamps_without_numbers import find_in_order, ROUNDING_NS, UNSENT
 import numpy as np
+
+_AT_ONCE = 4096
+"""Messages whose publications are compared at once, which bounds the memory."""
 
 
 class Sent(NamedTuple):
@@ -64,19 +63,33 @@ def find_stamps(sent: Sent, stamps: Ints, numbers: Ints) -> tuple[Ints, list[int
     found[which[mine]] = stamps[mine]       # the first one is written last
     if not several.any():
         return found, []
+    # before this one all had ended
+    first = np.searchsorted(np.maximum.accumulate(sent.ends), stamps - ROUNDING_NS, 'left')
+    first = np.maximum(first, begun - UNSENT)
     may_have = _Numbers(sent.publisher, which, numbers)
-    sending = BeingSent(sent.begins.tolist(), sent.ends.tolist())
-    sending.stamps = found.tolist()
-    unknown = []
-    for stamp, number in zip(stamps[several].tolist(), numbers[several].tolist()):
-        fits = sending.being_sent(stamp)
-        if len(fits) > 1:
-            fits = [place for place in fits if may_have(place, number)]
-        if len(fits) == 1:
-            sending.stamps[fits[0]] = stamp
-        else:
-            unknown.append(stamp)
-    return np.array(sending.stamps, dtype=np.int64), unknown
+    unknown = list[int]()
+    doubtful = np.flatnonzero(several)
+    for at in range(0, len(doubtful), _AT_ONCE):
+        asked = doubtful[at:at + _AT_ONCE]
+        counts = begun[asked] - first[asked]
+        of = np.repeat(np.arange(len(asked)), counts)
+        place = np.arange(len(of)) + np.repeat(first[asked] + counts - np.cumsum(counts), counts)
+        fits = (found[place] == 0) & (sent.ends[place] >= stamps[asked][of] - ROUNDING_NS)
+        of, place = of[fits], place[fits]
+        possible = may_have(place, numbers[asked][of])
+        pairs = list(zip(place.tolist(), possible.tolist()))
+        ends = np.searchsorted(of, np.arange(len(asked)), 'right').tolist()
+        given = dict[int, int]()
+        for stamp, begin, end in zip(stamps[asked].tolist(), [0, *ends], ends):
+            left = [pair for pair in pairs[begin:end] if pair[0] not in given]
+            if len(left) > 1:
+                left = [pair for pair in left if pair[1]]
+            if len(left) == 1:
+                given[left[0][0]] = stamp
+            else:
+                unknown.append(stamp)
+        found[list(given)] = list(given.values())
+    return found, unknown
 
 
 class _Numbers:
@@ -87,19 +100,24 @@ class _Numbers:
     """
 
     def __init__(self, publisher: Ints, which: Ints, numbers: Ints) -> None:
-        self._publisher = publisher.tolist()
+        publishers, self._publisher = different(publisher)
         self._place = np.zeros(len(publisher), dtype=np.int64)
-        self._known: dict[int, tuple[Ints, Ints]] = {}
-        messages = np.flatnonzero(which >= 0)
-        of = publisher[which[messages]]
-        for each in distinct(publisher).tolist():
-            mine, some = np.flatnonzero(publisher == each), messages[of == each]
-            self._place[mine] = np.arange(len(mine))
+        self._known: list[tuple[Ints, Ints]] = []
+        messages, n = np.flatnonzero(which >= 0), len(publishers)
+        for mine, some in zip(rows_by(self._publisher, n), rows_by(
+                self._publisher[which[messages]], n)):
+            self._place[mine], some = np.arange(len(mine)), messages[some]
             some = some[np.argsort(numbers[some], kind='stable')]
-            self._known[each] = numbers[some], numbers[some] - self._place[which[some]]
+            self._known.append((numbers[some], numbers[some] - self._place[which[some]]))
 
-    def __call__(self, place: int, number: int) -> bool:
-        """Return whether the message of a publication may have a number."""
-        numbers, away = self._known[self._publisher[place]]
-        at, mine = int(np.searchsorted(numbers, number)), number - self._place[place]
-        return bool((at == 0 or mine >= away[at - 1]) and (at == len(away) or mine <= away[at]))
+    def __call__(self, places: Ints, numbers: Ints) -> Mask:
+        """Return whether the messages of publications may have numbers."""
+        found = np.zeros(len(places), dtype=np.bool_)
+        by_publisher = rows_by(self._publisher[places], len(self._known))
+        for (known, away), mine in zip(self._known, by_publisher):
+            at, here = np.searchsorted(known, numbers[mine]), numbers[mine] - self._place[
+                places[mine]]
+            least, most = np.append(here.min(initial=0), away), np.append(
+                away, here.max(initial=0))
+            found[mine] = (here >= least[at]) & (here <= most[at])
+        return found

@@ -17,7 +17,7 @@ import numpy as np
 
 ROUNDING_NS = 1_000
 """Rounding of the two clocks that timestamp and publication are read from."""
-_UNSENT = 256
+UNSENT = 256
 """Number of publications of a topic without a timestamp that are compared."""
 
 
@@ -42,7 +42,7 @@ class BeingSent:
     def being_sent(self, stamp: int) -> list[int]:
         """Return the publications without timestamp that were being sent at a time."""
         last = bisect_right(self._times, stamp + ROUNDING_NS)
-        least, begun = last - _UNSENT, stamp - ROUNDING_NS
+        least, begun = last - UNSENT, stamp - ROUNDING_NS
         fits, place = [], last - 1
         while place >= max(0, least):
             if self._ends[place] < begun:

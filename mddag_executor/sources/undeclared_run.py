@@ -55,6 +55,7 @@ from mddag_executor.sources.imported_events import (
     END,
     Events,
     OWN_KINDS,
+    RCLCPP,
     SHUTDOWN,
     START,
     TAKE,
@@ -89,15 +90,12 @@ class OwnLinks(Links):
         others = super()._stamp_messages() if not everything else np.empty((0, 2), dtype=np.int64)
         table, found = self.events, self.messages
         kind = table['kind']
-        sent = np.zeros(len(table), dtype=np.bool_)
-        sent[found['at']] = True
         # a publication is being sent until the next one, or until the callback ends
         ends = np.full(len(found), NEVER)
-        stops = sent | (kind <= END)
-        before = self._last(stops, stops)
-        at = np.flatnonzero(stops)
-        mine = (before >= 0) & sent[before]
-        ends[self._row[before[mine]]] = table['time'][at[mine]]
+        at = self._order[self._are(RCLCPP, START, END)[self._order]]
+        thread, row = table['thread'][at], self._row[at]
+        followed = np.flatnonzero((row[:-1] >= 0) & (thread[1:] == thread[:-1]))
+        ends[row[followed]] = table['time'][at[followed + 1]]
         begins = found['time']
         if self.shift.any():    # the middleware stamps by the clock of the system
             shift = self.shift[table['thread'][found['at']]]
@@ -170,15 +168,19 @@ class OwnLinks(Links):
             for one in {id(callback) for callback in callbacks}:
                 subscriptions.setdefault(one, []).append(number)
         for callback, these in zip(self.callbacks, runs_by):
-            mine = np.sort(np.concatenate([taken[:0], *(
-                taken[takes_by[each]] for each in subscriptions.get(id(callback), ()))]))
-            these = own[these] if len(mine) else mine
+            if id(callback) not in subscriptions:
+                continue
+            mine = np.concatenate([taken[takes_by[each]] for each in subscriptions[id(callback)]])
+            mine.sort(kind='stable')
+            these = own[these]
             place = as_of(time[mine], ready[these])
             these, place = these[place >= 0], place[place >= 0]
-            # a message starts one execution; its pieces have the same ready time
-            _, first, which = np.unique(place, return_index=True, return_inverse=True)
-            same = ready[these] == ready[these[first[which]]]
-            taken_at[these[same]] = mine[place[same]]
+            if not (place[1:] > place[:-1]).all():
+                # a message starts one execution; its pieces have the same ready time
+                _, first, which = np.unique(place, return_index=True, return_inverse=True)
+                same = ready[these] == ready[these[first[which]]]
+                these, place = these[same], place[same]
+            taken_at[these] = mine[place]
         runs['ready'][own] = np.clip(ready[own], 0, start)
         due = np.where((due > 0) & (due <= runs['ready']), due, 0)
         is_timer = np.array([each.kind == 'timer' for each in self.callbacks], dtype=np.bool_)[
@@ -325,9 +327,10 @@ class UndeclaredRun(ImportedRun):
             ready[timers] = self._due(timers, self.links.runs['start'][timers])
         for callback, mine in zip(
                 self.links.callbacks, rows_by(number, len(self.links.callbacks))):
-            times = distinct(ready[mine[(due[mine] == 0) & own[mine]]])
-            if callback.kind == 'timer' and len(times):
-                callback.grid = _grid(times, callback.period)
+            if callback.kind == 'timer':
+                times = distinct(ready[mine[(due[mine] == 0) & own[mine]]])
+                if len(times):
+                    callback.grid = _grid(times, callback.period)
         # the time at which a request was taken is not recorded
         release = self._releases(jobs, ready, 'timer', 'service')
         timer = (is_timer & own & (due == 0))[jobs.sources]

@@ -399,7 +399,7 @@ class Counted(list):
 def test_publications_that_were_being_sent_are_found(sent, data):
     """As by comparing all of the last ones."""
     module = stamps_without_numbers
-    rounding, most = module.ROUNDING_NS, module._UNSENT
+    rounding, most = module.ROUNDING_NS, module.UNSENT
     times = [rounding * each for each in itertools.accumulate(gap for gap, _ in sent)]
     ends = [time + rounding * took for time, (_, took) in zip(times, sent)]
     topic = module.BeingSent(times, ends)
