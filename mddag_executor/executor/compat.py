@@ -488,7 +488,9 @@ def requested_service(future: Any) -> str:
     for callback in tuple(getattr(future, '_callbacks', None) or ()):  # asyncio's may be None
         client = getattr(callback, '__self__', None)
         if isinstance(client, rclpy.client.Client):
-            return service_name(client)
+            with suppress(InvalidHandle):
+                return service_name(client)
+            return f'{client.srv_name}, whose client is destroyed'
     return ''
 
 

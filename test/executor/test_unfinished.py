@@ -185,3 +185,26 @@ def test_what_runs_long_and_ends_is_recorded_once(
     assert (table['end'] >= table['start']).all()
     rows = list(zip(*(table[name].tolist() for name in ('callback', 'start'))))
     assert len(set(rows)) == len(rows)
+
+
+def test_the_client_of_a_waiting_coroutine_may_be_destroyed(make_executor, make_node, tmp_path):
+    """Programs destroy their nodes when they end, while coroutines wait for responses."""
+    node, sent = make_node('robot'), []
+    client = node.create_client(Trigger, '/never')
+
+    async def ask():
+        sent.append(client.call_async(Trigger.Request()))
+        await sent[-1]
+
+    node.create_timer(0.01, ask)
+    executor = make_executor(trace=str(tmp_path / 'run.mcap'), nodes=[node])
+
+    def places():
+        return [each['where'] for each in executor.statistics()['unfinished']]
+
+    with Session(executor):
+        assert wait_for(lambda: places() and 'service /never' in places()[0])
+        node.destroy_client(client)
+        assert places()[0].endswith('waits for service /never, whose client is destroyed')
+    assert places()
+    sent[0].set_result(None)
