@@ -8,8 +8,8 @@ from mddag_executor.sources.open import open_recording
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from std_msgs.msg import Empty
 
+from .asking import Asking
 from .inside import engine_of
-from .test_requests import Asking
 
 
 def test_a_request_waits_for_its_callback_group_only(make_executor, make_node):
