@@ -114,8 +114,7 @@ def _aged_priority(t: Tables, s: State, vertex: int, queue: int, now: int) -> in
     """Return the largest priority of a queue whose first execution was late, since it was."""
     if s.queue_demoted[queue] < 0:
         s.queue_demoted[queue] = now + LATE_DEADLINES * t.late_deadline[t.dag_of[vertex]]
-    return _priority(
-        t, s, vertex, s.queue_demoted[queue], t.rad_offset[vertex], t.latest_start[vertex])
+    return _priority_of_turn(t, s, vertex, s.queue_demoted[queue])
 
 
 def _late_priority(t: Tables, s: State, x: int, now: int) -> int:
@@ -133,7 +132,20 @@ def _late_priority(t: Tables, s: State, x: int, now: int) -> int:
         s.job_demoted[slot] = release
     if queue >= 0:
         s.queue_demoted[queue] = release
-    return _priority(t, s, vertex, release, t.rad_offset[vertex], t.latest_start[vertex])
+    return _priority_of_turn(t, s, vertex, release)
+
+
+def _priority_of_turn(t: Tables, s: State, vertex: int, release: int) -> int:
+    """Return the priority of a late vertex that counts as released at a time."""
+    priority = _priority(t, s, vertex, release, t.rad_offset[vertex], t.latest_start[vertex])
+    return min(priority, release + t.late_deadline[t.dag_of[vertex]])
+
+
+def take_turn(s: State, x: int) -> None:
+    """Let the job of an execution that starts in a late queue be as old at its later vertices."""
+    slot, turn = s.x_slot[x], s.queue_demoted[s.x_queue[x]]
+    if s.job_demoted[slot] < 0 or turn < s.job_demoted[slot]:
+        s.job_demoted[slot] = turn
 
 
 def _priority(t: Tables, s: State, vertex: int, release: int, deadline: int, start: int) -> int:

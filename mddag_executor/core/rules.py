@@ -35,8 +35,8 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     including the time in which it is preempted or suspended.  If a queue comes first while the
     group of its first execution is busy, its entry is set aside in the heap of the group.  When
     the owner completes, the smallest entry of the group returns.  Until then the owner is *urged*:
-    it has at most the priority of each execution that was set aside, and was not late then
-    (``urge``).  Otherwise all that is more urgent than the owner would hold up what waits for it.
+    it has at most the priority of each entry that was set aside (``urge``).  Otherwise all that is
+    more urgent than the owner would hold up what waits for it.
     A group of a user's own class lets executions run one by one.  If the owner may begin, it
     leaves the group for ever (``leave_group``).  If it may not, it waits as the owner, so that no
     other execution overtakes it (``refuse``, then ``ask_again``).
@@ -60,9 +60,9 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     that comes first is *late* if none of its executions can be in time at any of their sinks: the
     time plus the mean execution times on the longest path to the sink is past its deadline.  Until
     one of its executions starts, a late queue counts as released ``LATE_DEADLINES`` relative
-    deadlines later, and so does the job of its first execution at all later vertices.  (In a DAG
-    without any deadline it does not: its relative deadline is ten periods already.)  So late
-    work ages, and each callback gets some time.  As long as another execution in the queue can be
+    deadlines later, and so does the job of its first execution at all later vertices, as does the
+    job of an execution that starts in a late queue.  (In a DAG without any deadline the queue
+    counts as due at once: its relative deadline is ten periods already.)  So late work ages, and each callback gets some time.  As long as another execution in the queue can be
     in time, the queue has the place of the first such execution, by the earliest deadline that
     this one can meet.  So a backlog is worked off.  In a lasting overload
     (``State.overloaded``) the mean execution times of the executions before it count as well.
@@ -148,6 +148,7 @@ from mddag_executor.core.overload import (
     is_late,
     next_entry,
     note_late,
+    take_turn,
 )
 from mddag_executor.core.policies import KeyFunction
 from mddag_executor.core.queues import (
@@ -319,9 +320,9 @@ def peek(t: Tables, s: State, now: int) -> int:
     """
     Return the execution that is dispatched next, or -1 when none may run.
 
-    An execution that cannot be next is set aside: if its group is busy, in the heap of the group
-    (rule 4); if it may not hold the interpreter, with those that are deferred (rule 10).  Late
-    queues are demoted (rule 7).
+    Late queues are demoted (rule 7).  An execution that cannot be next is set aside: if its group
+    is busy, in the heap of the group (rule 4); if it may not hold the interpreter, with those that
+    are deferred (rule 10).
     """
     heap = s.ready
     if s.deferred:
@@ -331,9 +332,13 @@ def peek(t: Tables, s: State, now: int) -> int:
         queue = entry[4]
         x = s.queue_first[queue] if queue >= 0 else ~queue
         group = s.x_group[x]
-        if group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
+        if (now > s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]
+                and demote(t, s, heap, x, now)):
+            let_group(s, x)  # others of the group may go first
+            _let_others(s, x)
+        elif group >= 0 and s.group_owner[group] != -1 and s.group_owner[group] != x:
             heappop(heap)
-            _wait_for_group(t, s, entry, x, now)
+            _wait_for_group(s, entry, group)
             _let_others(s, x)
         elif s.outer_limit and not has_place(s, x):
             heappop(heap)
@@ -341,10 +346,6 @@ def peek(t: Tables, s: State, now: int) -> int:
                 s.x_aside[x] = now
             wait_for_outer(s, entry, s.x_outer[x])
             let_group(s, x)  # others of the group may be of another outer one
-        elif (now > s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]
-                and demote(t, s, heap, x, now)):
-            let_group(s, x)  # others of the group may go first
-            _let_others(s, x)
         elif s.x_holds[x] != 0 and s.scalars[N_HOLDING] > 0 and not may_start(s, entry):
             defer(s, heap, s.deferred)
             let_group(s, x)
@@ -355,15 +356,13 @@ def peek(t: Tables, s: State, now: int) -> int:
     return -1
 
 
-def _wait_for_group(t: Tables, s: State, entry: QueueEntry, x: int, now: int) -> None:
-    """Set the entry of an execution aside until its group is free, and urge the owner (rule 4)."""
-    group = s.x_group[x]
+def _wait_for_group(s: State, entry: QueueEntry, group: int) -> None:
+    """Set an entry aside until its group is free, and urge the owner (rule 4)."""
     if entry[4] >= 0:
         s.queue_place[entry[4]] = group
     heappush(s.group_heap[group], entry)
     owner = s.group_owner[group]
-    if entry[0] < s.x_key[owner][0] and (
-            now <= s.job_release[s.x_slot[x]] + s.start_by[s.x_vertex[x]]):
+    if entry[0] < s.x_key[owner][0]:
         urge(s, owner, entry[0])
 
 
@@ -407,6 +406,8 @@ def take(t: Tables, s: State, worker: int, now: int) -> int:
     s.x_key[x] = entry
     queue = entry[4]
     if queue >= 0:
+        if s.queue_demoted[queue] >= 0:
+            take_turn(s, x)
         after = s.queue_first[queue] = s.x_next[x]
         if after < 0:
             s.queue_last[queue] = s.queue_demoted[queue] = -1

@@ -27,10 +27,11 @@ Its reading of the documents:
   together need more than the workers, the executions before it in the queue take their time as
   well.  If no execution can be in time, the queue is ordered as if the job of its head were
   released eight relative deadlines later, until one of its executions runs; so are the later
-  vertices of that job.  Once a head was late, the queue has no later place than that until one of
+  vertices of that job, and those of a job whose execution is the one that runs.  Once a head was late, the queue has no later place than that until one of
   its executions runs, even if others can be in time.  A preempted execution is a queue by itself.
-* Suppose that an execution would start next, but another one of its group has begun and not ended.
-  If the first one is not late for any deadline, the other one has its priority until it ends.
+* Suppose that the head of a queue would start next, but another execution of its group has begun
+  and not ended.  Then that one has its priority until it ends.  It is not looked at again before
+  its place changes, or it is the first one of those that wait when the group is free.
 * ``keep: newest`` at a source or sink: of two executions in a queue, the one of the earlier job is
   dropped.  With ``demote``, an execution of a timer that can make none of the deadlines that it
   leads to is dropped when a later one becomes ready.  If a late execution is dropped, its queue
@@ -132,6 +133,8 @@ class BruteForce:
         # by DAG and vertex: the place of the queue, and the release by which it is late
         self.places = {}
         self.demoted = {}
+        # the queues that wait for their group, and their places when they came first
+        self.aside = {}
         self.round = []
         self.jobs = []
         self.events = []
@@ -356,12 +359,15 @@ class BruteForce:
     def _drop(self, dropped):
         for old in dropped:
             job, sink = old.job, old.vertex.index
-            late = self._is_late(old)
+            late, key = self._is_late(old), self._at(old)
+            if late or self._queue(key)[0] is old:
+                self.aside.pop(key, None)
             self.waiting.remove(old)
+            self._call_next(old)
             if late:
                 lowest = self._late_priority(old, True)
-                after = self.key(self._queue(self._at(old))[0])
-                self.places[self._at(old)] = (min(lowest, after[0]), *after[1:])
+                after = self.key(self._queue(key)[0])
+                self.places[key] = (min(lowest, after[0]), *after[1:])
             if job.outcome is not None:
                 continue
             if old.vertex.predecessors:
@@ -414,6 +420,7 @@ class BruteForce:
                 happened = True
                 self._note('end', worker, execution)
                 self.running[worker] = None
+                self._call_next(execution)
                 self._complete(execution.job, execution.vertex)
         return happened
 
@@ -457,18 +464,34 @@ class BruteForce:
     def _first_able(self):
         """Return what may start first; those before it urge the owners of their groups."""
         for each in sorted(self._heads(), key=self._place_of):
-            owner = self._owner(each)
+            owner, key = self._owner(each), self._at(each)
+            if owner is not None and self.aside.get(key) == self.places[key]:
+                continue
+            if self._demote(each):
+                self._call_next(each)
+                return self._first_able()
             if owner is None:
                 return each
-            place = self._place_of(each)[0]
-            if self._demotes(each.job.dag) and self._late_sinks(each, 0):
-                continue
+            self.aside[key] = self.places[key]
+            place = self.places[key][0]
             if owner in self.running and place < owner.running_as:
                 owner.urged = owner.running_as = place
             elif owner not in self.running and place < self.priority(owner):
                 owner.urged = place
                 return self._first_able()
         return None
+
+    def _call_next(self, execution):
+        """Look again at the first queue that waits for a group, if that is free."""
+        group = execution.vertex.callback.node, execution.vertex.callback.group
+        of_group = [key for key, place in self.aside.items()
+                    if place == self.places.get(key) and group == self._group_at(*key)]
+        if of_group and self._owner(execution) is None:
+            del self.aside[min(of_group, key=self.aside.get)]
+
+    def _group_at(self, dag, vertex):
+        callback = self.dags[dag].vertices[vertex].callback
+        return callback.node, callback.group
 
     def _hand_out(self):
         """Hand out one execution; False when that is not possible."""
@@ -478,8 +501,6 @@ class BruteForce:
             best = self._first_able()
         if best is None:
             return False
-        if self._demote(best):
-            return True
         if None in self.running:
             self._start(best, self.running.index(None))
             return True
@@ -528,7 +549,11 @@ class BruteForce:
             execution.running_as = self.priority(execution)
         else:
             execution.running_as = self.places.pop(key)[0]
-            self.demoted.pop(key, None)
+            self.aside.pop(key, None)
+            turn = self.demoted.pop(key, None)
+            if turn is not None:
+                job = execution.job
+                job.demoted = turn if job.demoted is None else min(turn, job.demoted)
             if queue := self._queue(key):
                 self.places[key] = self.key(queue[0])
         execution.has_run = True
