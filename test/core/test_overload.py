@@ -239,11 +239,16 @@ def test_no_callback_starves(case, heavier):
             assert start - waits_since <= most, (dag, last, waits_since, start)
 
 
-def chain(name, period, deadline, times):
-    """Declare a DAG of callbacks one after the other, each with its execution time; in ticks."""
+def chain(name, period, deadline, times, **more):
+    """
+    Declare a DAG of callbacks one after the other, each with its execution time; in ticks.
+
+    :param more: keys of its sink.
+    """
     last = len(times) - 1
     return [{'node': f'/{name}{place}', 'name': f'{name}{place}', 'execution_time': f'{time}us',
-             **({'publishes': [f'/{name}{place}']} if place < last else {'deadline': deadline}),
+             **({'publishes': [f'/{name}{place}']} if place < last else {
+                 'deadline': deadline, **more}),
              **({'subscription': f'/{name}{place - 1}'} if place else {
                  'timer': f'{period}us', 'dag': name, 'on_late': 'demote'})}
             for place, time in enumerate(times)]
@@ -283,6 +288,48 @@ def test_no_dag_of_several_callbacks_starves(capacity):
         assert longest <= 12 * max(
             task_set.dags[dag].vertices[sink].deadline_ns for sink in task_set.dags[dag].sinks
         ) / TICK + 4 * each_once, (dag, times[-3:])
+
+
+def overloaded(seed):
+    """Return chains at three times the capacity, with callback groups and importance, by seed."""
+    rng = random.Random(seed)
+    callbacks, rows = [], []
+    shares = [rng.expovariate(1) + 0.05 for _ in range(rng.randint(4, 8))]
+    for number, share in enumerate(shares):
+        period = rng.choice([10, 20, 50, 100, 500])
+        parts = [rng.random() + 0.1 for _ in range(rng.randint(1, 3))]
+        row = tuple(max(1, round(3 * period * share / sum(shares) * part / sum(parts)))
+                    for part in parts)
+        deadline = rng.choice([f'{round(period * rng.uniform(0.5, 2))}us'] * 3 + ['none'])
+        more = {} if deadline == 'none' else {
+            'importance': rng.choice(['high', 'normal', 'low'])}
+        mine = chain(f'd{number}x', period, deadline, row, **more)
+        for callback in mine:
+            callback['node'] = rng.choice(['/n', '/m'])
+            if rng.random() < 0.7:
+                callback['group'] = rng.choice('gh')
+        callbacks += mine
+        rows.append(row)
+    return Case(declaration(callbacks), tuple(rows), rng.randint(1, 2), 'rad', rng.random() < 0.5)
+
+
+@pytest.mark.parametrize('seed', [12, 30, 50, 58, 81, 94, 110, 113])
+def test_each_callback_of_a_chain_runs_once_in_ten_deadlines(seed):
+    """Also if its callback group is busy, or a preempted callback owns the group."""
+    case, horizon = overloaded(seed), 12_000
+    starts = {}
+    for time, kind, _, dag, vertex, _ in case.events(
+            simulated(case, case.load(horizon), horizon)):
+        if kind == 'start':
+            starts.setdefault((dag, vertex), [0]).append(time)
+    each_once = sum(map(sum, case.ticks))
+    for dag in case.task_set.dags:
+        deadlines = [dag.vertices[sink].deadline_ns for sink in dag.sinks]
+        most = (dag.period_ns + 10 * max(deadlines, default=NEVER)) / TICK + 2 * each_once
+        for vertex in dag.vertices:
+            times = starts.get((dag.index, vertex.index), [0])
+            assert max(after - before for before, after in zip(times, [*times[1:], horizon])) <= (
+                most), (vertex.name, times[-3:])
 
 
 def test_a_measured_time_that_is_not_renewed_is_forgotten():
