@@ -62,10 +62,11 @@ the tables ``t`` and the state ``s``, and uses only integer arithmetic, list ind
     one of its executions starts, a late queue counts as released ``LATE_DEADLINES`` relative
     deadlines later, and so does the job of its first execution at all later vertices, as does the
     job of an execution that starts in a late queue.  (In a DAG without any deadline the queue
-    counts as due at once: its relative deadline is ten periods already.)  So late work ages, and each callback gets some time.  As long as another execution in the queue can be
-    in time, the queue has the place of the first such execution, by the earliest deadline that
-    this one can meet.  So a backlog is worked off.  In a lasting overload
-    (``State.overloaded``) the mean execution times of the executions before it count as well.
+    counts as due at once: its relative deadline is ten periods already.)  So late work ages, and
+    each callback gets some time.  As long as another execution in the queue can be in time, the
+    queue has the place of the first such execution, by the earliest deadline that this one can
+    meet.  So a backlog is worked off.  In a lasting overload (``State.overloaded``) the mean
+    execution times of the executions before it count as well.
     But once a queue was late, or its first execution was, it has no later place than that of a
     late queue until one of its executions starts: otherwise new executions, which can be in time,
     would put it off again and again.

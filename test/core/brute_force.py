@@ -27,8 +27,9 @@ Its reading of the documents:
   together need more than the workers, the executions before it in the queue take their time as
   well.  If no execution can be in time, the queue is ordered as if the job of its head were
   released eight relative deadlines later, until one of its executions runs; so are the later
-  vertices of that job, and those of a job whose execution is the one that runs.  Once a head was late, the queue has no later place than that until one of
-  its executions runs, even if others can be in time.  A preempted execution is a queue by itself.
+  vertices of that job, and those of a job whose execution is the one that runs.  Once a head was
+  late, the queue has no later place than that until one of its executions runs, even if others can
+  be in time.  A preempted execution is a queue by itself.
 * Suppose that the head of a queue would start next, but another execution of its group has begun
   and not ended.  Then that one has its priority until it ends.  It is not looked at again before
   its place changes, or it is the first one of those that wait when the group is free.

@@ -123,6 +123,9 @@ may not check
         'executor/groups.py', 'self._number(rclpy_object if decides else group)', '-1'), (
         'executor/groups.py', 'entity.exclusive = group', 'pass')], of(
         'test_executor.py', 'test_mutually_exclusive_group_is_kept')),
+    Case('what_waits_for_a_group_urges_nobody', [(
+        'core/rules.py', '        urge(s, owner, entry[0])', '        pass')], of(
+        'test_engine.py', 'test_what_waits_for_a_callback_group_urges_its_owner[False]')),
     Case('rad_is_fifo', [(
         'core/policies.py', "Policy('rad', key_rad,", "Policy('rad', key_fifo,")], of(
         'test_deadlines.py', 'test_ready_callbacks_run_in_the_policys_order[rad-abc]')),
