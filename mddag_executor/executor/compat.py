@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from functools import partial
+from functools import cache, partial
 import inspect
 from operator import attrgetter
 import os
@@ -242,6 +242,27 @@ class QuickCallback:
         self._function()
 
 
+@cache
+def _makes_futures_twice(code: types.CodeType) -> bool:
+    """Return whether ``send_goal_async`` makes two futures for a goal's request (9.1.2)."""
+    try:
+        return inspect.getsource(code).count('.add_future(') > 1
+    except OSError:  # there is no source
+        return False
+
+
+def _is_sending(client: Any, code: types.CodeType, number: int) -> bool:
+    """Return whether a thread is still in ``send_goal_async`` with the request of a number."""
+    for top in sys._current_frames().values():
+        frame: Any = top
+        while frame is not None:
+            if frame.f_code is code and frame.f_locals.get('self') is client and (
+                    frame.f_locals.get('sequence_number', number) == number):
+                return True
+            frame = frame.f_back
+    return False
+
+
 _NUMBERS = {
     'goal': '_goal_sequence_number_to_goal_id', 'cancel': '_pending_cancel_requests',
     'result': '_pending_result_requests'}
@@ -253,11 +274,17 @@ def sender_is_behind(waitable: Any, data: Any) -> bool:
 
     In 7.1.5 it sends a request before it notes its number, and discards responses that come in
     between: the future would never be done (rclpy issue 1123). From 7.1.6 on a lock prevents that.
+    In 9.1.2 it makes the future of a goal's request twice, and the second one, which it returns,
+    without the lock: a response in between would complete the first one.
 
     :param data: the data that the waitable has taken.
     """
-    if type(data) is not dict or hasattr(waitable, '_lock'):
+    if type(data) is not dict:
         return False
+    if hasattr(waitable, '_lock'):
+        code = getattr(getattr(waitable, 'send_goal_async', None), '__code__', None)
+        return 'goal' in data and code is not None and _makes_futures_twice(code) and (
+            _is_sending(waitable, code, data['goal'][0]))
     return all(hasattr(waitable, numbers) for numbers in _NUMBERS.values()) and any(
         name in data and data[name][0] not in getattr(waitable, numbers)
         for name, numbers in _NUMBERS.items())

@@ -100,6 +100,25 @@ def test_the_server_of_many_goals_is_asked_once_when_the_first_one_expires(
     counting.destroy()
 
 
+def test_a_response_that_comes_while_its_goal_is_being_sent(make_executor, make_node):
+    """In rclpy 9.1.2, the client makes the future once more after the request has been sent."""
+    class Slow(dict):
+        def __setitem__(self, key, value):
+            time.sleep(0.1)
+            super().__setitem__(key, value)
+
+    nodes = [make_node('server'), make_node('client')]
+    counting = Counting(*nodes)
+    counting.client._feedback_callbacks = Slow()
+    executor = make_executor(nodes=nodes)
+    with Spinning(executor):
+        assert counting.client.wait_for_server(15.0)
+        task = executor.create_task(counting.ask(1))
+        assert wait_for(task.done)
+    assert task.result()[:2] == (SUCCEEDED, [0])
+    counting.destroy()
+
+
 @pytest.mark.parametrize('stepwise', [False, True])
 def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise):
     """The timer is within the server; nothing else happens meanwhile."""
