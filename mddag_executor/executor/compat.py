@@ -512,7 +512,8 @@ def awaited(coroutine: Any) -> Any:
 
 def requested_service(future: Any) -> str:
     """Return the name of the service whose response a future is; empty: it is another future."""
-    for callback in tuple(getattr(future, '_callbacks', None) or ()):  # asyncio's may be None
+    # a future of asyncio has None there once it is done
+    for callback in tuple(future._callbacks) if isinstance(future, Future) else ():
         client = getattr(callback, '__self__', None)
         if isinstance(client, rclpy.client.Client):
             with suppress(InvalidHandle):

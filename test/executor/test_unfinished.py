@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Callbacks that do not end: they are named live, in the trace, and as causes of misses."""
 
+import asyncio
 from functools import partial
 import shutil
 import threading
@@ -16,11 +17,11 @@ from mddag_executor.report.live_runs import live_lines
 from mddag_executor.report.replays import summary
 from msg_graph import loads
 import pytest
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from .conftest import wait_for
+from .conftest import Spinning, wait_for
 from .declared import graph
 from .inside import engine_of
 
@@ -93,6 +94,15 @@ def is_noted(path, killed, waits_for):
             found[0]['where'].endswith(waits_for))
     except MddagError:      # nothing has been written yet
         return False
+
+
+def count_notes(executor):
+    """Return a list that gets the number of unfinished executions each time they are noted."""
+    engine, notes = engine_of(executor), []
+    note = engine.note_unfinished
+    engine.note_unfinished = lambda several, now: (
+        notes.append(len(several)), note(several, now))
+    return notes
 
 
 @pytest.mark.parametrize('how', ['lock', 'service', 'future'])
@@ -170,10 +180,7 @@ def test_what_runs_long_and_ends_is_recorded_once(
 
     slow.create_timer(0.01, work)
     executor = make_executor(loads(GRAPH), trace=str(path), nodes=[robot.node, slow])
-    notes = []
-    note = engine_of(executor).note_unfinished
-    engine_of(executor).note_unfinished = lambda several, now: (
-        notes.append(len(several)), note(several, now))
+    notes = count_notes(executor)
     with Session(executor):
         assert wait_for(lambda: notes.count(2) > 1)
         robot.release()
@@ -187,24 +194,65 @@ def test_what_runs_long_and_ends_is_recorded_once(
     assert len(set(rows)) == len(rows)
 
 
-def test_the_client_of_a_waiting_coroutine_may_be_destroyed(make_executor, make_node, tmp_path):
-    """Programs destroy their nodes when they end, while coroutines wait for responses."""
-    node, sent = make_node('robot'), []
+def test_a_coroutine_outlives_the_client_that_it_waits_for(
+        make_executor, make_node, tmp_path, monkeypatch):
+    monkeypatch.setattr(unfinished, 'LONG_NS', 10 * MS)
+    monkeypatch.setattr('mddag_executor.sources.imported_run.LEAST_UNFINISHED_NS', 10 * MS)
+    node = make_node('robot')
     client = node.create_client(Trigger, '/never')
 
     async def ask():
-        sent.append(client.call_async(Trigger.Request()))
-        await sent[-1]
+        timer.cancel()
+        await client.call_async(Trigger.Request())
 
-    node.create_timer(0.01, ask)
+    timer = node.create_timer(0.01, ask)
     executor = make_executor(trace=str(tmp_path / 'run.mcap'), nodes=[node])
-
-    def places():
-        return [each['where'] for each in executor.statistics()['unfinished']]
-
-    with Session(executor):
-        assert wait_for(lambda: places() and 'service /never' in places()[0])
+    notes = count_notes(executor)
+    with Spinning(executor):
+        assert wait_for(engine_of(executor).begun)
         node.destroy_client(client)
-        assert places()[0].endswith('waits for service /never, whose client is destroyed')
-    assert places()
-    sent[0].set_result(None)
+        seen = len(notes)
+        assert wait_for(lambda: notes[seen:].count(1) > 1)
+        found, = executor.statistics()['unfinished']
+        assert found['where'].endswith(', waits for service /never, whose client is destroyed')
+    assert executor.statistics()['trace']['error'] is None
+    found, = replay(tmp_path / 'run.mcap').result()['unfinished']
+    assert found['where'].endswith(', waits for service /never, whose client is destroyed')
+
+
+def test_a_coroutine_that_has_slept_waits_for_a_worker(
+        make_executor, make_node, tmp_path, monkeypatch):
+    """Its future of asyncio is done; the only worker runs a callback that does not end."""
+    monkeypatch.setattr(unfinished, 'LONG_NS', 10 * MS)
+    node, reentrant = make_node('robot'), ReentrantCallbackGroup()
+    blocks, let_go, ended = threading.Event(), threading.Event(), threading.Event()
+
+    async def sleep():
+        sleeper.cancel()
+        while not blocks.is_set():
+            await asyncio.sleep(0.1)
+        ended.set()
+
+    def block():
+        blocker.cancel()
+        blocks.set()
+        let_go.wait(60.0)
+
+    sleeper = node.create_timer(0.01, sleep, callback_group=reentrant)
+    executor = make_executor(num_workers=1, trace=str(tmp_path / 'run.mcap'), nodes=[node],
+                             diagnostics_period='10s')
+    engine, notes = engine_of(executor), count_notes(executor)
+    with Spinning(executor):
+        assert wait_for(engine.begun)
+        blocker = node.create_timer(0.01, block, callback_group=reentrant)
+        assert wait_for(lambda: blocks.is_set() and engine.begun()[0].coroutine.waits_for.done())
+        where = [each['where'] for each in executor.statistics()['unfinished']
+                 if 'sleep' in each['callback']]
+        assert len(where) == 1 and where[0].endswith(', waits for a future')
+        assert executor._diagnostics._pool.status(0).level == 1
+        seen = len(notes)
+        assert wait_for(lambda: notes[seen:].count(2) > 1)
+        let_go.set()
+        assert wait_for(ended.is_set)
+    assert executor.statistics()['trace']['error'] is None
+    assert 'unfinished' not in replay(tmp_path / 'run.mcap').result()
