@@ -217,12 +217,15 @@ class Never(NamedTuple):
     :ivar dropped_at: by vertex when executions were dropped whose jobs are not recorded.
     :ivar started: executions that were started, a table of ``STARTED``.
     :ivar unpublished: by miss whether the callback before did not publish the message.
+    :ivar knows_waiting: whether the executions that waited at the end are recorded: each process
+        has ended in order.
     """
 
     dropped: Table
     dropped_at: dict[int, Ints]
     started: Table
     unpublished: Mask
+    knows_waiting: bool
 
     def drops_of(self, vertex: Ints, job: Ints) -> Ints:
         """Return the rows of ``dropped`` of vertices of jobs; -1: none."""
@@ -479,27 +482,35 @@ def _pending(
 
     A timer's skipped release waited if all workers were busy for most of the time; otherwise an
     execution before it waited, or it was noticed late.  The part of a dropped execution ends with
-    the drop.
+    the drop.  A recording that was cut off lacks the executions that waited then: they waited if a
+    callback that never ended kept their group busy for most of the time.
     """
     which = np.flatnonzero(spans['kind'] == _PENDING)
     miss, vertex, begin, end = (
         spans[name][which] for name in ('miss', 'vertex', 'begin', 'end'))
-    job, source = rows['job'][miss], is_source[vertex]
+    job, source, length = rows['job'][miss], is_source[vertex], end - begin
     start, drop = never.starts_of(vertex, job), never.drops_of(vertex, job)
     began, dropped = np.append(never.started['start'], 0)[start], drop >= 0
     waits = np.append(never.dropped['aborted'], False)[drop] | (start >= 0) & (
         np.append(never.started['ready'], 0)[start] < end) & (end <= began)
+    group = np.minimum(np.append(never.started['group'], 0)[start], length)
+    behind = np.where(source & ~dropped, never.waiting(vertex, end), -1)
     if pool.knows_workers:
         may_wait = np.flatnonzero(~waits & ~dropped & (
             (rows['kind'][miss] != SINK_EXPIRED) | source))
         full = pool.within('full', spans[which[may_wait]])
-        waits[may_wait] = 2 * full >= (end - begin)[may_wait]
+        waits[may_wait] = 2 * full >= length[may_wait]
+    if never.knows_waiting:
+        blocked = np.zeros(len(which), dtype=np.int64)
+    else:
+        blocked = np.where(waits | dropped | source | never.unpublished[miss], 0,
+                           _overlap(spans[which], pool.blocked))
+    waits |= 2 * blocked > length
     spans['kind'][which[waits]] = _WAIT
-    spans['more'][which[waits]] = np.minimum(
-        np.append(never.started['group'], 0)[start], end - begin)[waits]
+    spans['more'][which[waits]] = np.maximum(group, blocked)[waits]
     part = np.where(
         source & ~dropped,
-        np.where(never.waiting(vertex, end) >= 0, SKIPPED, RELEASED_LATE),
+        np.where(behind >= 0, SKIPPED, RELEASED_LATE),
         never.causes(miss, vertex, job, begin, end))
     other = which[~waits]
     times[other, part[~waits]] = left[other]

@@ -91,6 +91,8 @@ class Explanation:
         else:
             self._workers = 0 if run.head.policy in SIMULATED_ONLY else (
                 run.head.workers if run.processes == 1 else run.workers_each)
+        # whether what waited at the end is recorded
+        self._knows_waiting = run.imported or run.shut_down and run.processes == 1
         # where callbacks may delay each other: of another executor it is not known which threads
         # share its work
         self._place = self._executions['process'].astype(np.int64)
@@ -103,7 +105,8 @@ class Explanation:
         pool, usual = self._pool(missed), self._usual()
         missed['outranked'] = self._outranked(missed, links, usual)
         self._never = Never(
-            *self._dropped(), self._started(chains.waited.group), self._unpublished(missed))
+            *self._dropped(), self._started(chains.waited.group), self._unpublished(missed),
+            self._knows_waiting)
         self.found = find(
             missed, links, pool, usual, self._never,
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
@@ -341,7 +344,7 @@ class Explanation:
             one, self._task_set.dags[one.dag].vertices) if one.callback.topics]
 
     def _started(self, in_group: Ints) -> Table:
-        """Return the executions that were started, and sources that waited until a drop."""
+        """Return executions that were started, and sources that waited until a drop or the end."""
         recording, table = self._recording, self._executions
         which = np.flatnonzero((table['vertex'] >= 0) & (table['start'] >= 0))
         started = rows(STARTED, len(which), group=in_group[which], **{
@@ -356,15 +359,33 @@ class Explanation:
             np.array([*self._tables.dag_of, -1])[drops['vertex']], drops['job'])] = np.arange(
             len(drops))
         mine = np.flatnonzero(drop[:-1] >= 0)
-        if not len(mine):
+        waits = self._open_sources(started)
+        if not len(mine) + len(waits):
             return started
         # a release that was skipped at the time of the abort was skipped before it
         dropped = drops[drop[mine]]
-        sources = rows(
+        sources = concatenate([waits, rows(
             STARTED, len(mine), vertex=dropped['vertex'], job=dropped['job'],
-            ready=recording.jobs.noticed[mine], start=dropped['time'] + 1)
+            ready=recording.jobs.noticed[mine], start=dropped['time'] + 1)])
         sources['group'] = self._in_groups(sources)
         return concatenate([started, sources])
+
+    def _open_sources(self, started: Table) -> Table:
+        """Return the sources that waited when the recording was cut off, which does not say so."""
+        recording = self._recording
+        if self._knows_waiting:
+            return rows(STARTED)
+        jobs, ends = recording.jobs, recording.job_ends
+        dags = np.repeat(np.arange(len(jobs.first) - 1), np.diff(jobs.first))
+        source = np.array([*self._tables.source], dtype=np.int64)[dags]
+        is_open = np.ones(len(jobs) + 1, dtype=np.bool_)
+        is_open[jobs.places(ends)] = False
+        for table in (started, recording.drops):
+            is_open[jobs.places_of(
+                np.array([*self._tables.dag_of, -1])[table['vertex']], table['job'])] = False
+        mine = np.flatnonzero(is_open[:-1])
+        return rows(STARTED, len(mine), vertex=source[mine], job=jobs.number[mine],
+                    ready=jobs.noticed[mine], start=recording.end + 1)
 
     def _in_groups(self, waits: Table) -> Ints:
         """Return how long the callback groups of waiting vertices were busy meanwhile, ns."""

@@ -280,6 +280,48 @@ def test_a_release_is_skipped_for_what_the_one_before_waited_for(tmp_path):
     assert mostly['behind'] is not None
 
 
+@pytest.mark.parametrize('killed', [False, True])
+def test_what_a_callback_that_never_ends_keeps_waiting(killed, tmp_path, call):
+    """A process that is killed does not record what waits then: messages, and a timer."""
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+nodes:
+  - {node: /sensor, callbacks: [{name: tick, timer: 50ms, publishes: [/data]}]}
+  - node: /victim
+    callbacks:
+      - {name: use, subscription: /data, deadline: 12ms}
+      - {name: own, dag: own, timer: 50ms, deadline: 20ms}
+""", 2)
+    trace.group('mutually_exclusive', 1001, 1100)
+    waiting = []
+    for job in range(60):
+        at = job * 50
+        for dag in (0, 1):
+            trace.release(dag, job, at)
+        trace.run(0, TICK, job, at, at + 1)
+        if job < 10:
+            trace.run(0, USE, job, at + 1, at + 2, worker=1)
+            trace.run(1, 0, job, at + 2, at + 3, ready=at, worker=1)
+            continue
+        if job > 10:
+            waiting.append((1001, 0, USE, job, -1, ns(at + 1), 0))
+        if job == 10:
+            waiting.append((1100, 1, 0, job, -1, ns(at), 0))
+        else:
+            trace.add('expire', at, 1, job)     # skipped
+    trace.add('unfinished', 3000, 1001, 0, USE, 10, 1, ns(501), ns(501), 'at victim.py:3',
+              thread=11)
+    if killed:
+        trace.file.finish()
+    else:
+        for each in waiting:
+            trace.add('dispatch', 3000, *each)
+        trace.end(3000)
+    result = explained(trace.path)
+    assert result['causes']['never ended'] == result['missed'] == 100
+    assert '100 misses: 100 never ended\n' in call('explain', trace.path).stdout
+
+
 FOLLOWED = SYNC.replace('deadline: 22ms', 'publishes: [/out]') + """\
   - {node: /after, callbacks: [{name: act, subscription: /out, deadline: 22ms}]}
 """
