@@ -133,10 +133,14 @@ def _ending_signals() -> Iterator[list[int]]:
     An ignored signal (`nohup`) stays ignored.  Yields a list that gets the number of the signal.
     """
     received: list[int] = []
-    last = -math.inf
+    last, process = -math.inf, os.getpid()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal last
+        if os.getpid() != process:  # a node has forked this one, which ends as any other
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
         if (now := time.monotonic()) - last >= SAME_SIGNAL_S:
             last, received[:] = now, [number]
             raise KeyboardInterrupt

@@ -24,7 +24,7 @@ import threading
 import time
 from typing import Any, Protocol
 
-from mddag_executor.executor.compat import is_called_by_spin, joins_threads
+from mddag_executor.executor.compat import alive, is_called_by_spin, joins_threads
 from mddag_executor.executor.interrupts import interruptible_sleep, InterruptsDeferred
 from mddag_executor.executor.outer_groups import outer_here
 from mddag_executor.executor.tasks import watched
@@ -268,6 +268,7 @@ class GuestExecutor:
                 self.host.note_interrupt()
 
     def _adopt(self, nodes: list[Node]) -> None:
+        nodes = [node for node in nodes if alive(node)]     # the program may have destroyed others
         for node in nodes:
             owner = node if self.is_global else self
             self.host.put(node, self._group_of(owner))

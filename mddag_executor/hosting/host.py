@@ -68,6 +68,7 @@ from mddag_executor.hosting.change import Change
 from mddag_executor.hosting.guest import CONTEXT_HAS_ENDED, Guest
 from mddag_executor.hosting.guest_executor import GuestExecutor, make_guest
 from mddag_executor.hosting.loading import describe, LoadingError, Program, ProgramFailed, resolve
+from mddag_executor.hosting.run_options import spec_of
 from mddag_executor.hosting.signals import Signals
 from mddag_executor.replacements import instead, Replacements
 import rclpy
@@ -113,7 +114,9 @@ class Host:
         self.guest_of: Any = weakref.WeakKeyDictionary()  # by thread
         self._is_ending: Callable[[], bool] = lambda: False
         self._lend: Callable[[], Any] = nullcontext
-        self._all_started = self._ended = self._loading = False
+        self._all_started = self._ended = False
+        # the SPEC whose module is being imported
+        self._loading = ''
         self._lock = threading.RLock()  # reentrant: a signal handler may interrupt its owner
         self._node_of: Any = weakref.WeakKeyDictionary()  # by entity
         self._executors: Any = weakref.WeakSet()
@@ -132,6 +135,7 @@ class Host:
         self._main: threading.Thread | None = None
         self._of_main: SimpleQueue[Guest | None] = SimpleQueue()
         self._replacements = Replacements()
+        self._process = os.getpid()
 
     def __enter__(self) -> Host:
         context = self.context = rclpy.utilities.get_default_context()
@@ -171,11 +175,14 @@ class Host:
 
     def load(self, specs: Iterable[Any], ros_arguments: Iterable[str] = ()) -> list[Program]:
         """Find programs; their modules are imported under the host's replacements as well."""
-        self._loading = True
+        programs = []
         try:
-            return [resolve(spec, ros_arguments) for spec in specs]
+            for spec in specs:
+                self._loading = spec if isinstance(spec, str) else spec_of(spec)
+                programs.append(resolve(spec, ros_arguments))
         finally:
-            self._loading = False
+            self._loading = ''
+        return programs
 
     def run(
         self, supervise: Callable[[], Result],
@@ -428,7 +435,9 @@ class Host:
                 guest.program.spec if guest else name, f'node {name} has a context of its own',
                 'let it use the default context')
         if self.executor is None:
-            raise RuntimeError('a module spins a node while it is imported')
+            raise LoadingError(
+                self._loading, 'it spins a node while it is imported',
+                "call what spins in a function, or below `if __name__ == '__main__':`")
         for each in [] if guest is None else list(guest.nodes):
             if not alive(each):
                 self.release(each, guest)
@@ -646,13 +655,18 @@ class Host:
 
     def _init(self, args: Any = None, *, domain_id: int | None = None, **more: Any) -> None:
         guest = self.current_guest()
+        if os.getpid() != self._process:
+            raise LoadingError(
+                guest.program.spec if guest else 'rclpy.init',
+                'it has forked a process that uses rclpy, whose context is that of the run',
+                "start it with subprocess, or multiprocessing.get_context('spawn')")
         if guest is not None:
             guest.uses_ros = True
             if not guest.finished and not self._is_ending():
                 guest.ended = False  # as each rclpy.init after a shutdown makes a new context
         if domain_id is not None and domain_id != self.context.get_domain_id():
             raise LoadingError(
-                guest.program.spec if guest else 'rclpy.init',
+                guest.program.spec if guest else self._loading or 'rclpy.init',
                 f'it asks for ROS domain {domain_id}, and this process is in another',
                 f'set ROS_DOMAIN_ID={domain_id}, or run it by itself')
 

@@ -18,8 +18,8 @@ starts; the ``Host`` then runs the returned ``Program``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 import inspect
@@ -28,6 +28,7 @@ import os
 from pathlib import Path
 import shlex
 import sys
+import threading
 import traceback
 from types import ModuleType
 from typing import Any, cast
@@ -175,6 +176,8 @@ def _import(spec: str, module_name: str) -> ModuleType:
         raise LoadingError(
             spec, f"there is no module '{error.name or module_name}'",
             'check its name, install it, or add its folder to PYTHONPATH') from error
+    except LoadingError:    # it uses rclpy while it is imported
+        raise
     except Exception as error:
         wrong = isinstance(error, (ImportError, SyntaxError))  # else the program has raised
         raise (LoadingError if wrong else ProgramFailed)(
@@ -215,16 +218,34 @@ def _script(spec: str, path: Path) -> Program:
             spec, f'{path} is not valid Python ({describe(error)})', 'correct it') from None
 
     def run() -> None:
-        # Not runpy.run_path: it replaces sys.modules['__main__'] until the script ends, and
-        # several scripts run here concurrently, in threads.
+        # Not runpy.run_path: several scripts run here concurrently, in threads.
         folder = str(path.parent)
         if folder not in sys.path:
             sys.path.insert(0, folder)
         module = ModuleType('__main__')
         module.__file__ = str(path)
-        exec(code, module.__dict__)
+        with _as_main(module):
+            exec(code, module.__dict__)
 
     return Program(spec, str(path), run)
+
+
+@contextmanager
+def _as_main(module: ModuleType) -> Iterator[None]:
+    """
+    Let a script be found as ``__main__`` while it runs: pickle and multiprocessing look there.
+
+    There is only one: that of the main thread.
+    """
+    before = sys.modules['__main__']
+    is_main = threading.current_thread() is threading.main_thread()
+    if is_main:
+        sys.modules['__main__'] = module
+    try:
+        yield
+    finally:
+        if is_main:
+            sys.modules['__main__'] = before
 
 
 def describe(error: BaseException) -> str:

@@ -279,7 +279,7 @@ class Part:
     @classmethod
     def make(cls, folder: str, text: str, options: dict[str, Any]) -> None:
         """Prepare the folder of a run."""
-        Path(folder, 'run.json').write_text(json.dumps(
+        _write(Path(folder, 'run.json'), json.dumps(
             {'parent': os.getpid(), 'text': text, 'options': options}))
 
     @classmethod
@@ -340,7 +340,11 @@ class Part:
 def _write(path: Path, text: str) -> None:
     """Write a file that others never see half written."""
     part = path.with_suffix('.part')
-    part.write_text(text)
+    try:
+        part.write_text(text)
+    except OSError as error:    # a full disk
+        error.filename = error.filename or str(path.parent)
+        raise
     part.replace(path)
 
 

@@ -225,7 +225,7 @@ def spec_of(target: Any) -> str:
 
 def _nanoseconds(name: str, given: Any) -> int | None:
     try:
-        if given == 'off':
+        if given == 'off' and name == 'diagnostics':
             return 0
         if isinstance(given, str):
             from msg_graph import parse_duration

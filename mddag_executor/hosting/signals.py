@@ -77,6 +77,7 @@ class Signals:
         self._pipe: tuple[int, int] | None = None
         # how many of the SIGINTs to come are our own
         self._n_own = 0
+        self._process = os.getpid()
 
     def __enter__(self) -> Signals:
         """Note the handlers: those that a module sets while it is imported stay."""
@@ -101,6 +102,10 @@ class Signals:
             signal.signal(number, signal.SIG_IGN)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        if os.getpid() != self._process:    # a program has forked this one, which has no run
+            signal.signal(number, self._before[number])
+            os.kill(os.getpid(), number)
+            return
         if self._is_third(number):
             signal.default_int_handler(number, frame)
         self.received(number, number != signal.SIGINT)

@@ -52,7 +52,8 @@ def world(tmp_path, monkeypatch):
     library = prefix / 'lib' / 'chat_nodes'
     library.mkdir(parents=True)
     for name, text in {
-        'talker': '#!/usr/bin/env python3\n' + (GUESTS / 'talker.py').read_text(),
+        **{name: '#!/usr/bin/env python3\n' + (GUESTS / f'{name}.py').read_text()
+           for name in ('talker', 'pools')},
         'shell': '#!/bin/sh\nexit 0\n', 'broken.py': 'def (\n', 'native': '\x7fELF\x02\x01',
     }.items():
         (library / name).write_text(text)
@@ -156,7 +157,8 @@ PLAIN = 'import sys, chat; sys.exit(getattr(chat, sys.argv[1])())'
 @pytest.mark.parametrize(('name', 'status'), [
     ('returns_status', 4), ('returns_reason', 1), ('has_a_loop', 0), ('handles_signals', 3),
     ('stops_the_robot', 0), ('is_interrupted', 130), ('is_interrupted_before_it_begins', 130),
-    ('works_with_asyncio', 1), ('fails_at_the_end', 1), ('exits_early', 5)])
+    ('works_with_asyncio', 1), ('fails_at_the_end', 1), ('exits_early', 5),
+    ('destroys_a_node', 0)])
 def test_a_program_behaves_as_without_the_host(world, mddag, name, status):
     """It has the main thread: what it prints, what it raises and its exit status are the same."""
     plain = subprocess.run(
@@ -170,6 +172,21 @@ def test_a_program_behaves_as_without_the_host(world, mddag, name, status):
     elif name != 'exits_early':
         assert hosted.stderr == plain.stderr
     assert ('Traceback' in hosted.stderr) == ('Traceback' in plain.stderr)
+
+
+def test_a_script_may_start_processes(world, mddag):
+    """They find its functions and end with SIGTERM; a forked one has no context of its own."""
+    plain = subprocess.run([sys.executable, GUESTS / 'pools.py'], capture_output=True, text=True,
+                           timeout=60)
+    assert plain.stdout == (
+        'fork [0, 1, 4, 9]\nspawn [0, 1, 4, 9]\nended by -15\n'), plain.stderr
+    hosted = mddag('run', '-q', '--node', 'chat_nodes/pools')
+    assert (hosted.returncode, hosted.stdout, hosted.stderr) == (0, plain.stdout, '')
+    hosted = mddag('run', '-q', '--node', 'chat:forks_a_node')
+    assert (hosted.returncode, hosted.stdout) == (0, 'ended with 1\n')
+    assert hosted.stderr.splitlines()[-1].endswith(
+        '--node chat:forks_a_node: it has forked a process that uses rclpy, whose context is that '
+        "of the run: start it with subprocess, or multiprocessing.get_context('spawn')")
 
 
 EARLY = """\
@@ -353,6 +370,36 @@ def test_exceptions_come_out_behind_the_summary(world, mddag, names, lines):
     assert 'ZeroDivisionError' in done.stderr.splitlines()[-1]
     for line in lines:
         assert line in done.stdout + done.stderr
+
+
+FULL = """\
+import resource
+from rclpy.node import Node
+
+class Full(Node):
+    def __init__(self):
+        super().__init__('full')
+        self.create_timer(0.001, lambda: None)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+"""
+
+
+def test_a_run_goes_on_when_the_disk_is_full(world, mddag):
+    """What was recorded before is there, and the last line says what is not."""
+    Path('site/full.py').write_text(FULL)
+    done = mddag('run', '--node', 'full:Full', '--trace', 'run.mcap', '--duration', '4s',
+                 '--json', 'out.json')
+    result = json.loads(Path('out.json').read_text())
+    ran, = (each['ran'] for name, each in result['callbacks'].items() if '/full: ' in name)
+    recorded = len(open_recording('run.mcap').executions)
+    assert ran > recorded > 0 and result['trace']['lost'] >= ran - recorded, done.stderr
+    assert 'events lost: writing failed)' in done.stdout
+    assert done.returncode == 2
+    failed = (f'{world}/run.mcap: writing failed (File too large): what was written before is '
+              'there; free space, then try again')
+    at_once, at_the_end = (line for line in done.stderr.splitlines() if failed in line)
+    assert at_once.endswith(f': the trace is incomplete: {failed}')
+    assert at_the_end == f'error: {failed}'
 
 
 @contextmanager
@@ -561,6 +608,18 @@ def test_a_program_whose_start_the_end_of_the_run_cuts_off_has_not_failed(
         host.start(SingleThreadedExecutor(), host.load([spec]))
         assert host.end(lambda: True) == [] and type(host.guests[0].error) is error
     host.executor.shutdown()
+
+
+@pytest.mark.parametrize(('text', 'message'), [
+    ('rclpy.spin(rclpy.create_node("early"))\n', 'it spins a node while it is imported: call'),
+    ('rclpy.init(domain_id=7)\n', 'it asks for ROS domain 7, and this process is in another: ')])
+def test_what_a_module_must_not_do_while_it_is_imported(world, default_context, text, message):
+    (world / 'site' / 'at_import.py').write_text(
+        f'import rclpy\nrclpy.init()\n{text}\n\ndef main():\n    pass\n')
+    with Host() as host, pytest.raises(LoadingError) as error:
+        host.load(['at_import:main'])
+    assert str(error.value).startswith(f'--node at_import:main: {message}')
+    assert 'at_import' not in sys.modules
 
 
 def test_a_program_that_cannot_start_ends_the_run_with_one_line(world, mddag):

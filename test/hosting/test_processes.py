@@ -12,6 +12,7 @@ import sys
 
 from mddag_executor import replay, Traces
 from mddag_executor.analysis.drafting import System
+from mddag_executor.cli.main import user_line
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
 from mddag_executor.executor.session import Session
@@ -245,6 +246,13 @@ def test_synthetic_processes_leave_no_shared_memory(world):
         end(run)
     assert run.returncode == 0
     assert len(segments) == 2 and not any(path.exists() for path in segments)
+
+
+def test_a_full_disk_is_named(tmp_path):
+    (tmp_path / 'run.part').symlink_to('/dev/full')
+    with pytest.raises(OSError) as error:
+        processes.Part.make(str(tmp_path), 'mddag: 1', {})
+    assert (user_line(error.value) or '').startswith(f'{tmp_path}: no space left on device: free')
 
 
 def test_a_run_that_cannot_begin_leaves_no_trace(world, mddag):

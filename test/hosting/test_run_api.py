@@ -177,6 +177,7 @@ def test_a_program_that_the_end_of_the_time_interrupts_has_not_failed(here):
     ({}, 'nodes: give nodes to run, or synthetic, and not both'),
     ({'nodes': Api}, 'give a list, even for one node'),
     ({'nodes': ['a:b'], 'duration': '2 parsecs'}, "duration='2 parsecs': "),
+    ({'nodes': ['a:b'], 'duration': 'off'}, "duration='off': "),
     ({'nodes': ['a:b'], 'duration': -1}, "duration=-1: give a time such as '20s'"),
     ({'synthetic': 'sleep'}, '--synthetic: it needs the nodes of a declaration: give a GRAPH'),
     ({'synthetic': 'nap', 'graph': 'graph.yaml'}, "synthetic='nap': give one of sleep, spin, "),

@@ -3,6 +3,7 @@
 """Unmodified programs of many kinds; none knows of this executor."""
 
 import asyncio
+import multiprocessing
 import os
 import signal
 import sys
@@ -461,6 +462,30 @@ def never_spins():
     node.destroy_node()
     rclpy.shutdown()
     print('typed w')
+
+
+def destroys_a_node():
+    rclpy.init()
+    executor, ran = SingleThreadedExecutor(), []
+    lasting, brief = Node('lasting'), Node('brief')
+    lasting.create_timer(0.01, lambda: ran.append(1))
+    for node in (lasting, brief):
+        executor.add_node(node)
+    executor.spin_once()
+    brief.destroy_node()    # the executor still has it
+    for _ in range(3):
+        executor.spin_once()
+    print('ran', len(ran) >= 3)
+    rclpy.shutdown()
+
+
+def forks_a_node():
+    rclpy.init()
+    process = multiprocessing.get_context('fork').Process(target=rclpy.init)
+    process.start()
+    process.join()
+    print('ended with', process.exitcode)
+    rclpy.shutdown()
 
 
 def starts_slowly():
