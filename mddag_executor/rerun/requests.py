@@ -113,13 +113,13 @@ class Requests:
         if not isinstance(request, client.srv_type.Request):
             raise TypeError()
         with client.handle:  # else it has been destroyed
-            pass
+            name = service_name(client)
         number = next(self._numbers)
         future = new_request(client, number)
         heritage = self._loop.heritage()
         if heritage is not None:
             setattr(future, HERITAGE, heritage)
-        self._send(request, partial(self._ask, client, number, heritage))
+        self._send(request, partial(self._ask, name, client, number, heritage))
         return future
 
     def call(self, client: Client, request: Any, timeout_sec: float | None = None) -> Any:
@@ -134,9 +134,8 @@ class Requests:
         return future.result()
 
     def _ask(
-        self, client: Client, number: int, heritage: Heritage | None, request: Any
+        self, name: str, client: Client, number: int, heritage: Heritage | None, request: Any
     ) -> None:
-        name = service_name(client)
         entity = self._service(name)
         if entity is None:
             self._loop.warn(f'{name}: it is called, and no node of the run offers this service')

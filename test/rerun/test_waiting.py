@@ -63,6 +63,25 @@ def test_a_service_answers_in_virtual_time(bag, graph):
     assert not result.warnings
 
 
+def test_a_request_leaves_though_its_client_is_destroyed(bag, graph):
+    served = []
+
+    def make_server():
+        node = rclpy.create_node('server')
+        node.create_service(
+            Trigger, '/greet', lambda request, response: (served.append(node), response)[1])
+        return node
+
+    def take(node, number):
+        if number == 3:
+            client = node.create_client(Trigger, '/greet')
+            client.call_async(Trigger.Request())
+            node.destroy_client(client)
+
+    _, result = run_filter(bag, graph, take, make_server)
+    assert len(served) == 1 and not result.warnings
+
+
 @pytest.mark.parametrize('declared', [True, False])
 def test_a_request_of_a_callback_with_a_deadline_is_as_urgent(bag, graph, declared):
     """It goes before tasks that wait already."""
