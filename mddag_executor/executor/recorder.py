@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import nullcontext, suppress
 from itertools import count
 import socket
 import threading
@@ -27,6 +28,10 @@ from rclpy.utilities import get_rmw_implementation_identifier
 _numbers = count(1)
 
 
+def _log(error: TraceError) -> None:
+    get_logger('mddag_executor').error(f'the trace is incomplete: {error}')
+
+
 class Recorder:
     """
     The trace of one executor.
@@ -46,9 +51,11 @@ class Recorder:
         default_deadline: int, max_active_jobs: int, clock: TraceClock, writer: Any = None,
         cpus: int | None = None, overwrite: bool = False, on_late: str = 'continue',
     ) -> None:
+        self._is_live = writer is None
         if writer is None:
             from mddag_executor.trace.writer import TraceWriter  # late: it loads the compression
             writer = TraceWriter(path, clock_offset=clock.offset_ns, overwrite=overwrite)
+            writer.on_error = _log
         self.writer = writer
         self.record = self.writer.record
         self.path = path
@@ -142,13 +149,12 @@ class Recorder:
         """
         Record the run's end and complete the file.
 
-        If the file could not be written, the run has continued without it, and this logs an error.
+        If the file of a live run could not be written, the run has continued without it.
 
         :param end: until when deadlines are judged, if that is before now; on the trace's clock.
         """
         self.record(
             'shutdown', now, threading.get_native_id(), now if end is None else end)
-        try:
+        # a live run has logged the error when it happened, and goes on
+        with suppress(TraceError) if self._is_live else nullcontext():
             self.writer.close()
-        except TraceError as error:
-            get_logger('mddag_executor').error(f'the trace is incomplete: {error}')

@@ -43,6 +43,10 @@ def _nothing() -> None:
     pass
 
 
+def _log(error: TraceError) -> None:
+    _LOGGER.error('%s', error)
+
+
 class TraceWriter:
     """
     Records events from many threads into a trace file.
@@ -67,6 +71,8 @@ class TraceWriter:
         self.before_write: Callable[[], None] = _nothing
         #: Why recording ended early; None: no error.
         self.error: TraceError | None = None
+        #: Called by the writer thread with this error, at once.
+        self.on_error: Callable[[TraceError], None] = _log
         self._file = TraceFile(path, overwrite=overwrite)
         self._interval_s = flush_interval_s
         self._pending: deque[tuple[Any, ...]] = deque()
@@ -198,4 +204,4 @@ class TraceWriter:
             taken = self._given + sum(map(events_of, self._slice))
             self._lost += taken - self._file.rejected - self._file.written
         self.error = error
-        _LOGGER.error('%s', error)
+        self.on_error(error)

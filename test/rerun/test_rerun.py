@@ -8,6 +8,7 @@ from functools import cached_property, partial
 import gc
 import os
 import random
+import resource
 import sqlite3
 import threading
 import uuid
@@ -31,7 +32,7 @@ from mddag_executor.simulate import draw_execution_times, periodic_workload, sim
 from mddag_executor.simulate import END as ENDS
 from mddag_executor.simulate import Settings as SimulatorSettings
 from mddag_executor.simulate import START as STARTS
-from mddag_executor.trace import TraceReader
+from mddag_executor.trace import TraceError, TraceReader
 from msg_graph import load, loads
 from msg_graph.duration import parse_duration
 import numpy
@@ -435,6 +436,21 @@ def write_chunks(path, count):
             writer.add_message(channel, at, serialize_message(Header(frame_id=str(i))), at)
         writer.finish()
     return str(path)
+
+
+def test_a_trace_that_cannot_be_written_is_an_error(bag, graph, tmp_path):
+    """It is written at the end: until then its events fill no chunk."""
+    path, before = tmp_path / 'run.mcap', resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def take(node, number):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000, before[1]))
+
+    try:
+        with pytest.raises(TraceError, match=f'{path}: writing failed .File too large'):
+            run_filter(bag, graph, take, trace=str(path))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not path.exists()
 
 
 def test_damage_that_is_found_when_messages_are_loaded_is_said(tmp_path, graph):
