@@ -137,8 +137,11 @@ def _count_for(seconds: float) -> int:
     return round(10 ** 6 * seconds / min(took(10 ** 6) for _ in range(5)))
 
 
-def record(cause: str, trace: Path, misses: int, scale: float = 1.0) -> None:
-    """Record a run with about this many misses."""
+def record(
+    cause: str, trace: Path, misses: int, scale: float = 1.0
+) -> list[tuple[int, int]]:
+    """Record a run with about this many misses; return begin and end of each stop, epoch ns."""
+    stops = []
     seconds = misses * PERIODS[cause] * PERIOD_MS / 1e3 * scale + 1
     process = subprocess.Popen(
         [sys.executable, __file__, '--record', cause, str(trace), str(seconds),
@@ -150,12 +153,15 @@ def record(cause: str, trace: Path, misses: int, scale: float = 1.0) -> None:
         while cause == 'machine' and time.monotonic() < end - 3 * STOP_S * scale:
             time.sleep(2 * STOP_S * scale)
             process.send_signal(signal.SIGSTOP)
+            begin = time.time_ns()
             time.sleep(STOP_S * scale)
+            stops.append((begin, time.time_ns()))
             process.send_signal(signal.SIGCONT)
         assert process.wait(seconds + 60) == 0
     finally:
         process.kill()
         process.wait()
+    return stops
 
 
 def causes(trace: Path) -> dict[str, int]:
