@@ -12,7 +12,8 @@ Theory of operation
     and run before those of Python.  In their place, Python's wake-up descriptor reports each
     signal to a thread, and the thread ends the run if rclpy would have shut the context down
     (``ends_run``).
-3.  A program may take the wake-up descriptor (as asyncio's loops do).  Then its spin reports the
+3.  A process that a program forks has the handlers of before the run: it ends with SIGTERM.
+4.  A program may take the wake-up descriptor (as asyncio's loops do).  Then its spin reports the
     KeyboardInterrupt that it gets (``interrupted``).
 """
 
@@ -77,7 +78,6 @@ class Signals:
         self._pipe: tuple[int, int] | None = None
         # how many of the SIGINTs to come are our own
         self._n_own = 0
-        self._process = os.getpid()
 
     def __enter__(self) -> Signals:
         """Note the handlers: those that a module sets while it is imported stay."""
@@ -88,6 +88,7 @@ class Signals:
         """From now on they end this session."""
         self._session = session
         if threading.current_thread() is threading.main_thread():
+            _active.append(self)
             for number in _NUMBERS:
                 now = signal.getsignal(number)
                 if now == self._found[number] and (
@@ -95,6 +96,8 @@ class Signals:
                     self._before[number] = signal.signal(number, self._handle)
 
     def __exit__(self, *args: object) -> None:
+        if self in _active:
+            _active.remove(self)
         for number, before in self._before.items():
             signal.signal(number, before)
         for number in self._before if self._ends_process and self._last is not None else ():
@@ -102,10 +105,6 @@ class Signals:
             signal.signal(number, signal.SIG_IGN)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if os.getpid() != self._process:    # a program has forked this one, which has no run
-            signal.signal(number, self._before[number])
-            os.kill(os.getpid(), number)
-            return
         if self._is_third(number):
             signal.default_int_handler(number, frame)
         self.received(number, number != signal.SIGINT)
@@ -133,6 +132,13 @@ class Signals:
                     self._last is None or now - self._last > SAME_SIGNAL_S):
                 self._last, self._hurried = now, True
                 session.hurry()
+
+    def leave_child(self) -> None:
+        """Restore the handlers in a child that a program has forked: it has no run."""
+        for number, before in self._before.items():
+            if handler_of(number) == self._handle:
+                signal.signal(number, before)
+        self._before = {}
 
     # --- a program in the main thread ------------------------------------------------------------
 
@@ -216,13 +222,36 @@ class Signals:
 
 _given: list[tuple[int, int]] = []
 """The pipes of programs that have the main thread."""
+_active: list[Signals] = []
+"""Those that have replaced the handlers of signals."""
+_blocked = threading.local()
+"""``before``: the signal mask of a thread that forks, before it does."""
+
+
+def _block() -> None:
+    """Block signals that would end a child before it has its own handlers: Python drops them."""
+    if _active:
+        _blocked.before = signal.pthread_sigmask(
+            signal.SIG_BLOCK, (signal.SIGTERM, signal.SIGHUP))
+
+
+def _unblock() -> None:
+    before = getattr(_blocked, 'before', None)
+    if before is not None:
+        _blocked.before = None
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _forget_in_child() -> None:
-    """Let a forked child not report its own signals to its parent."""
-    if _given:
-        with suppress(ValueError):  # another thread than the main one has forked
+    """Let a forked child handle its own signals, and not report them to its parent."""
+    with suppress(ValueError):  # another thread than the main one has forked
+        if _given:
             signal.set_wakeup_fd(-1)
+        for signals in _active:
+            signals.leave_child()
+    _active.clear()
+    _unblock()
 
 
-os.register_at_fork(after_in_child=_forget_in_child)
+os.register_at_fork(
+    before=_block, after_in_parent=_unblock, after_in_child=_forget_in_child)

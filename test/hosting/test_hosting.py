@@ -179,7 +179,7 @@ def test_a_script_may_start_processes(world, mddag):
     plain = subprocess.run([sys.executable, GUESTS / 'pools.py'], capture_output=True, text=True,
                            timeout=60)
     assert plain.stdout == (
-        'fork [0, 1, 4, 9]\nspawn [0, 1, 4, 9]\nended by -15\n'), plain.stderr
+        'fork [0, 1, 4, 9]\nspawn [0, 1, 4, 9]\nended by {-15}\n'), plain.stderr
     hosted = mddag('run', '-q', '--node', 'chat_nodes/pools')
     assert (hosted.returncode, hosted.stdout, hosted.stderr) == (0, plain.stdout, '')
     hosted = mddag('run', '-q', '--node', 'chat:forks_a_node')

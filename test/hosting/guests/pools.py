@@ -18,12 +18,15 @@ def main():
     for method in (fork, multiprocessing.get_context('spawn')):
         with method.Pool(2) as pool:
             print(method.get_start_method(), pool.map(square, range(4)), flush=True)
-    sleeper = fork.Process(target=time.sleep, args=(60.0,))
-    sleeper.start()
-    sleeper.terminate()
-    sleeper.join(30.0)
-    print('ended by', sleeper.exitcode, flush=True)
-    sleeper.kill()
+    sleepers = [fork.Process(target=time.sleep, args=(60.0,)) for _ in range(10)]
+    for each in sleepers:
+        each.start()
+        each.terminate()
+    for each in sleepers:
+        each.join(30.0)
+    print('ended by', {each.exitcode for each in sleepers}, flush=True)
+    for each in sleepers:
+        each.kill()
     rclpy.init()
     node = Node('pools')
     node.create_timer(0.01, lambda: None)
