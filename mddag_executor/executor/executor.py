@@ -72,6 +72,7 @@ from mddag_executor.executor.waitables import WaitSetThread
 from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Work
 from mddag_executor.executor.workers import WorkerPool
+from mddag_executor.output_rules import remove_recording, version_of
 from mddag_executor.results.runs import Statistics
 from msg_graph import TaskSet
 from rclpy.duration import Duration
@@ -191,6 +192,7 @@ class MultiDeadlineExecutor(BareExecutor):
         raise_limit()
         fail = weakly(self._fail)
         self._trace_clock = TraceClock()
+        earlier = None if trace is None else version_of(os.fspath(trace))
         self._recorder = None if trace is None else Recorder(
             os.fspath(trace), task_set, policy, num_workers, deadline_ns, max_active_jobs,
             self._trace_clock, overwrite=overwrite, on_late=on_late)
@@ -223,6 +225,7 @@ class MultiDeadlineExecutor(BareExecutor):
                 self._ending.undo()
             if self._recorder is not None:
                 self._recorder.close(self._trace_clock.now())
+                remove_recording(self._recorder.path, earlier)
             raise
 
     def _complete(

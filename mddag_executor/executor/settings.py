@@ -172,6 +172,12 @@ def thread_setting(
             f"worker_policy: '{policy}' is unknown: give one of {', '.join(THREAD_POLICIES)}")
     if priority is not None and priority != 0:  # 0: that of SCHED_OTHER
         whole_number('worker_priority', priority, 99)
+    if policy is not None:
+        least, most = (ask(getattr(os, policy)) for ask in (
+            os.sched_get_priority_min, os.sched_get_priority_max))
+        if not least <= (priority or 0) <= most:
+            raise UsageError(f'worker_priority: {policy} ' + (
+                f'needs one: give {least} to {most}' if most else 'has none: leave it out'))
     if cpus is not None:
         mine, given = os.sched_getaffinity(0), cpus
         cpus = set(given) if isinstance(given, Iterable) else set()

@@ -10,6 +10,8 @@ import threading
 import weakref
 
 from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor import settings
+from mddag_executor.executor.compat import RCLError
 from mddag_executor.executor.session import Session
 import pytest
 import rclpy
@@ -242,6 +244,7 @@ def test_too_many_open_files_leave_nothing_behind(
         except Exception as error:  # the trace's own; too many open files
             assert 'open files' in str(error).lower(), (more, error)
             errors += 1
+            assert not (tmp_path / 'run.mcap').exists()
         else:
             executor.shutdown()
             break
@@ -252,3 +255,26 @@ def test_too_many_open_files_leave_nothing_behind(
     gc.collect()
     assert wait_for(lambda: used()[0] <= before[0] and used()[1] <= before[1])
     assert unraisable == []
+
+
+def test_a_context_that_ends_meanwhile_leaves_nothing_behind(monkeypatch, tmp_path):
+    """No trace either, for which the next executor would need `overwrite`."""
+    check = settings.check_context
+
+    def end(context):
+        check(context)
+        context.shutdown()
+
+    monkeypatch.setattr(settings, 'check_context', end)
+    before = []
+    for _ in range(3):
+        context = Context()
+        context.init()
+        with pytest.raises(RCLError, match='context is not valid'):
+            MultiDeadlineExecutor(
+                context=context, trace=tmp_path / 'run.mcap', diagnostics_period='1s')
+        assert not (tmp_path / 'run.mcap').exists()
+        del context
+        gc.collect()
+        before.append(used())
+    assert wait_for(lambda: used()[0] <= before[0][0] and used()[1] <= before[0][1])

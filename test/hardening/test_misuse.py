@@ -42,6 +42,15 @@ def test_a_wrong_argument_is_named_in_one_line(ros_context, tmp_path, name):
     assert not trace.exists()
 
 
+@pytest.mark.parametrize(('policy', 'priority', 'line'), [
+    ('SCHED_FIFO', None, 'worker_priority: SCHED_FIFO needs one: give 1 to 99'),
+    ('SCHED_OTHER', 5, 'worker_priority: SCHED_OTHER has none: leave it out')])
+def test_a_priority_that_does_not_fit_its_policy(ros_context, policy, priority, line):
+    with pytest.raises(MddagError, match=f'^{line}$'):
+        MultiDeadlineExecutor(
+            context=ros_context, worker_policy=policy, worker_priority=priority)
+
+
 def test_a_path_that_leads_nowhere(ros_context):
     for graph in ('', 'no/such.yaml', '/', 'a\0b'):
         with pytest.raises(msg_graph.GraphError) as caught:
