@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real runs are replayed, and their misses have the cause that they were given."""
 
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 import random
@@ -392,8 +393,8 @@ def test_the_cause_of_most_misses(tmp_path):
     def found(cause):
         for misses in (9, 36):  # a busy machine has stops of its own, so that fewer are made
             trace = tmp_path / f'{cause}{misses}.mcap'
-            record(cause, trace, misses, scale=3.0)
-            told = causes(trace)
+            stops = record(cause, trace, misses, scale=3.0)
+            told = causes(trace) if cause != 'machine' else causes_in(trace, stops)
             if told.get(cause, 0) >= 5:
                 break
         return told
@@ -402,6 +403,16 @@ def test_the_cause_of_most_misses(tmp_path):
     with ThreadPoolExecutor() as pool:
         for cause, told in zip(kinds, pool.map(found, kinds)):
             assert told.get(cause, 0) >= 5, cause
-            # after each stop of a busy machine there are misses of many kinds
-            assert cause == 'machine' or all(
-                n <= told[cause] for other, n in told.items() if other != 'machine'), told
+            assert all(n <= told[cause] for other, n in told.items() if other != 'machine'), told
+            # what a busy machine makes late besides has other causes as well
+            assert cause != 'machine' or [*told] == ['machine']
+
+
+def causes_in(trace, stops):
+    """Return by cause the misses whose release and deadline are in a stop of the process."""
+    replayed = replay(trace)
+    deadline = replayed.result()['dags']['/sensor']['sinks']['/victim:use']['relative_deadline_ns']
+    return Counter(
+        job['cause'] for job in replayed.explanation.result()['jobs']
+        if job['sink'] == '/victim:use' and any(
+            begin <= job['release_ns'] <= end - deadline for begin, end in stops))
