@@ -300,6 +300,14 @@ class CallbackLoop(asyncio.SelectorEventLoop):
         if executor is not None:
             executor.shutdown(wait=False)
 
+    def calls(self, function: Callable[[], object]) -> bool:
+        """Let its thread call a function; False: it does not within ``CLOSE_S``."""
+        self._start()
+        has_called = threading.Event()
+        self.call_soon_threadsafe(function)
+        self.call_soon_threadsafe(has_called.set)
+        return has_called.wait(CLOSE_S)
+
     def end(self) -> None:
         """Cancel what is not done, end the thread, and close the loop."""
         thread = self._thread

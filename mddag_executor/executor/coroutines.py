@@ -67,17 +67,20 @@ class Loops:
                 if is_asyncio_future(steps.waits_for):
                     self._warn(f'{name}: its coroutine {name_of(steps.get_coro())} has not ended '
                                'before its executor: it is cancelled')
-                    self._abandon(name, steps)
+                    if not self._abandon(name, steps):
+                        break
         finally:
             if self._loop is not None:
                 self._loop.end()
 
-    def _abandon(self, name: str, steps: Steps) -> None:
+    def _abandon(self, name: str, steps: Steps) -> bool:
+        """Cancel a coroutine; return False if a callback of asyncio keeps all from ending."""
         try:
-            steps.abandon()
+            return steps.abandon()
         except Exception as error:
             self._warn(f'{name}: its coroutine, when it was cancelled, raised '
                        f'{type(error).__name__}: {error}')
+            return True
 
 
 class _NoLoop:
@@ -225,11 +228,16 @@ class Steps:
         if self.has_joined or isinstance(loop, CallbackLoop) and loop.is_owner():
             loop.leave(self)
 
-    def abandon(self) -> None:
-        """Cancel the coroutine, which is suspended, and let it run its last step."""
+    def abandon(self) -> bool:
+        """
+        Cancel the coroutine, which is suspended, and let it run its last step.
+
+        :return: False: it cannot, as a callback in the thread of its loop does not end.
+        """
         waits_for, loop = self.waits_for, self.loop
         if isinstance(loop, CallbackLoop):
-            loop.call_in_turn(lambda _: self.cancel())
+            if not loop.calls(self.cancel):
+                return False
             end = time.monotonic() + CLOSE_S
             while not waits_for.done() and time.monotonic() < end:  # a task ends some time later
                 time.sleep(0.001)
@@ -243,6 +251,7 @@ class Steps:
                 self._drive.close()
         except (StopIteration, asyncio.CancelledError):
             pass
+        return True
 
     # --- as asyncio's current task ---------------------------------------------------------------
 

@@ -243,7 +243,7 @@ class MultiDeadlineExecutor(BareExecutor):
         super().__init__(context=context)
         self._pool.attach(self)
         self._wait_sets = self._ending.wait_sets = WaitSetThread(
-            self._pool, self.signal_guard(), weakly(self._signalled))
+            self._pool, self.signal_guard(), weakly(self._signalled), weakly(self._has_failed))
         self._upkeep = self._ending.upkeep = Upkeep(
             weakly(self._nodes_to_serve), self._registry, self._pool, self._at_once,
             self._wait_sets)
@@ -618,6 +618,10 @@ class MultiDeadlineExecutor(BareExecutor):
         """Store an exception of another thread; the spin raises it."""
         self._errors.append(error)
         self._at_once.ring()
+
+    def _has_failed(self) -> bool:
+        """Return whether the next spin raises an exception of another thread."""
+        return bool(self._errors)
 
     def _raise_error(self) -> None:
         self._unclaimed.check()

@@ -54,6 +54,9 @@ TIMER_NS = 1_000_000
 SENDER_CHECKS = 500
 """For how many ms to wait with a response until its request is noted (7.1.5)."""
 
+_SHORTEST_NAP_S, _LONGEST_NAP_S = 0.001, 0.1
+"""How long to wait before waitables of which one has failed are asked again."""
+
 Result = TypeVar('Result')
 
 
@@ -490,13 +493,18 @@ class WaitSetThread:
 
     :param signals: rclpy's signal condition, or None.
     :param on_signal: called when it is triggered.
+    :param has_failed: returns whether the next spin raises an exception already.
     """
 
-    def __init__(self, pool: Hall, signals: Any, on_signal: Callable[[], None]) -> None:
+    def __init__(
+        self, pool: Hall, signals: Any, on_signal: Callable[[], None],
+        has_failed: Callable[[], bool],
+    ) -> None:
         self._pool = pool
         self._context = pool.context
         self._signals = signals
         self._on_signal = on_signal
+        self._has_failed = has_failed
         self._guard = GuardCondition(None, None, self._context)
         # those to wait for from the next ``apply`` on, and now
         self._next_entities: list[Entity] = []
@@ -583,6 +591,7 @@ class WaitSetThread:
 
     def _run(self) -> None:
         waiting: Asked | None = None
+        reported, nap_s = '', _SHORTEST_NAP_S
         while not self._ending and not is_over(self._context):
             try:
                 is_new = self._changed or waiting is None
@@ -595,13 +604,18 @@ class WaitSetThread:
                 self._wait(waiting, 0 if is_new or asked != self._answered else -1)
                 self._answered = asked
                 self._has_answered.set()
+                nap_s = _SHORTEST_NAP_S
             except Exception as error:
                 waiting = None
                 if is_over(self._context):
                     break
-                if not isinstance(error, InvalidHandle):
+                # the same one comes again and again: each spin raises it once
+                if not isinstance(error, InvalidHandle) and not (
+                        self._has_failed() and reported == repr(error)):
+                    reported = repr(error)
                     self._pool.fail(error)
-                time.sleep(0.001)  # an entity is being destroyed; avoids a busy loop if it stays
+                time.sleep(nap_s)  # an entity is being destroyed; avoids a busy loop if it stays
+                nap_s = min(2 * nap_s, _LONGEST_NAP_S)
         self._applied.set()
         self._on_signal()
 

@@ -519,3 +519,32 @@ def test_spin_async_ends_as_spin_does(make_executor, ros_context):
             await asyncio.wait_for(spinning, 10)
 
     asyncio.run(main())
+
+
+def test_a_callback_of_asyncio_that_does_not_end_is_abandoned(
+        ros_context, make_node, monkeypatch, capfd):
+    """So are the coroutines of its loop; the executor ends."""
+    for module in ('asyncio_loop', 'coroutines'):
+        monkeypatch.setattr(f'mddag_executor.executor.{module}.CLOSE_S', 0.1)
+    blocks, let_go = threading.Event(), threading.Event()
+
+    def block():
+        blocks.set()
+        let_go.wait(60.0)
+
+    async def sleep():
+        timer.cancel()
+        asyncio.get_running_loop().call_soon(block)
+        await asyncio.sleep(100)
+
+    node = make_node()
+    timer = node.create_timer(0.01, sleep)
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    try:
+        with Spinning(executor):
+            assert wait_for(lambda: blocks.is_set() and begun(executor))
+        assert 'a callback of asyncio has not ended: it is abandoned' in capfd.readouterr().err
+    finally:
+        let_go.set()
+    assert wait_for(lambda: not any(t.name == 'mddag-asyncio' for t in threading.enumerate()))

@@ -3,6 +3,7 @@
 """Actions, QoS events, guard conditions, waitables of a user's own, and timers with info."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 import os
 import sys
 import threading
@@ -16,6 +17,7 @@ from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
@@ -404,3 +406,34 @@ def test_no_event_is_taken_for_another_while_events_come_and_go(make_executor, m
     finally:
         sys.setswitchinterval(interval)
     assert len(matched) > 10 and wrong == []
+
+
+class Broken(Waitable):
+    """A waitable that contains no entity, and raises whenever it is asked."""
+
+    def __init__(self):
+        super().__init__(ReentrantCallbackGroup())
+
+    def is_ready(self, wait_set):
+        raise ValueError('no device')
+
+    def get_num_entities(self):
+        return NumberOfEntities(0, 0, 0, 0, 0, 0)
+
+    def add_to_wait_set(self, wait_set):
+        pass
+
+
+def test_a_waitable_that_fails_again_and_again_is_raised_by_each_spin_once(
+        make_executor, make_node):
+    node, broken = make_node(), Broken()
+    node.add_waitable(broken)
+    executor = make_executor(nodes=[node])
+    for _ in range(3):
+        with pytest.raises(ValueError, match='no device'):
+            executor.spin_until_future_complete(Future(), patience(30.0))
+        time.sleep(0.1)     # it is asked meanwhile
+    node.remove_waitable(broken)
+    with suppress(ValueError):
+        executor.spin_until_future_complete(Future(), 0.1)
+    executor.spin_until_future_complete(Future(), 0.1)
