@@ -16,7 +16,7 @@ from mddag_executor.cli.main import user_line
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
 from mddag_executor.executor.session import Session
-from mddag_executor.hosting import processes
+from mddag_executor.hosting import processes, run, RunOptions, RunWarning
 from mddag_executor.shared_memory import segments_removed
 from mddag_executor.trace import read_events
 from msg_graph import loads
@@ -246,6 +246,17 @@ def test_synthetic_processes_leave_no_shared_memory(world):
         end(run)
     assert run.returncode == 0
     assert len(segments) == 2 and not any(path.exists() for path in segments)
+
+
+def test_a_process_without_the_others_begins_after_a_while(world, monkeypatch):
+    """As a launch file may start it before them, or alone."""
+    monkeypatch.syspath_prepend(str(GUESTS))
+    monkeypatch.setattr('mddag_executor.hosting.run_here._ALONE_S', 0.1)
+    with pytest.warns(RunWarning, match='/raw: .* have not discovered each other .* messages '
+                      'that are lost meanwhile count as missed$'):
+        result = run(RunOptions(nodes=['relay:first'], graph='graph.yaml', process='up',
+                                duration='200ms', diagnostics='off'))
+    assert result.status == 0 and result.has_started
 
 
 def test_a_full_disk_is_named(tmp_path):

@@ -63,6 +63,19 @@ def test_a_service_answers_in_virtual_time(bag, graph):
     assert not result.warnings
 
 
+def test_a_call_that_is_not_answered_in_time_returns_nothing(bag, graph):
+    """What comes later is ignored."""
+    def take(node, number):
+        if number == 3:
+            node.note(node.client.call(Trigger.Request(), timeout_sec=0.05))
+
+    def fill(node):
+        node.client = node.create_client(Trigger, '/greet')
+
+    seen, result = run_filter(bag, graph, take, lambda: server(200), workers=2, fill=fill)
+    assert seen == [(350.0, None)] and not result.warnings
+
+
 def test_a_request_leaves_though_its_client_is_destroyed(bag, graph):
     served = []
 
