@@ -36,8 +36,9 @@ def statistics(
         elsewhere = set() if engine.other_processes is None else engine.other_processes.elsewhere()
     elsewhere |= registry.bindings.elsewhere(process)
     callbacks = cast('dict[str, CallbackCounts]', registry.counts())
+    begun = {each['callback'] for each in running}
     never_ran = [c.key for c in registry.bindings.declared
-                 if c.key not in elsewhere
+                 if c.key not in elsewhere and c.key not in begun
                  and (c.key not in callbacks or not callbacks[c.key]['ran'])]
     for dag in result['dags'].values():  # their sinks are judged in their own processes
         dag['sinks'] = {name: sink for name, sink in dag['sinks'].items()

@@ -357,6 +357,7 @@ def read_result(folder: str, pid: int) -> Any:
 def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
     """Return the result of a run, combined from those of its processes."""
     parts = list(results.values())
+    begun = {each['callback'] for part in parts for each in part['unfinished']}
     callbacks: dict[str, dict[str, Any]] = {}
     for part in parts:  # executors' internal callbacks may share a name
         for name, counts in part['callbacks'].items():
@@ -378,7 +379,7 @@ def combine_results(task_set: TaskSet, results: Results) -> dict[str, Any]:
                          for key in ('unknown', 'doubtful')},
         # of a process that has died nothing is known
         'never_ran': [c.key for c in task_set.callbacks
-                      if str(task_set.process_of(c.node)) in results
+                      if str(task_set.process_of(c.node)) in results and c.key not in begun
                       and not callbacks.get(c.key, {'ran': 0})['ran']],
         'not_found': {key: question for part in parts
                       for key, question in part['not_found'].items()},

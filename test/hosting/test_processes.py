@@ -9,12 +9,14 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
 from mddag_executor import replay, Traces
 from mddag_executor.analysis.drafting import System
 from mddag_executor.cli.main import user_line
 from mddag_executor.clocks import boot
 from mddag_executor.core.tally import counts
+from mddag_executor.defaults import SAME_SIGNAL_S
 from mddag_executor.executor.session import Session
 from mddag_executor.hosting import processes, run, RunOptions, RunWarning
 from mddag_executor.shared_memory import segments_removed
@@ -191,6 +193,39 @@ def test_an_end_while_processes_start_is_quiet(world):
         said = run.communicate(timeout=60)
     assert (run.returncode, *said) == (130, '', '')
     assert not list(world.glob('*.mcap')) and not (world / 'result.json').exists()
+
+
+HANGS = """\
+from pathlib import Path
+import time
+from rclpy.node import Node
+
+def make(name):
+    node = Node(name, start_parameter_services=False)
+    node.create_timer(0.009, lambda: (Path(name).touch(), time.sleep(600.0)))
+    return node
+
+def a():
+    return make('a')
+
+def b():
+    return make('b')
+"""
+
+
+def test_a_second_interrupt_abandons_what_hangs_in_any_process(world):
+    (world / 'hangs.py').write_text(HANGS)
+    (world / 'two.yaml').write_text(TWO_PROCESSES)
+    with running('two.yaml', '--node', 'one=hangs:a', '--node', 'two=hangs:b') as run:
+        wait_for_run(run, lambda: (world / 'a').exists() and (world / 'b').exists())
+        run.send_signal(signal.SIGINT)
+        time.sleep(2 * SAME_SIGNAL_S)       # before, another one counts as the same
+        assert run.poll() is None
+        run.send_signal(signal.SIGINT)
+        result, out, errors = end(run)
+    assert run.returncode == 0 and errors.count('a callback has not ended in time') == 2
+    assert sorted(each['callback'] for each in result['unfinished']) == ['/a:t', '/b:t']
+    assert result['never_ran'] == [] and 'never ran' not in out
 
 
 def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
