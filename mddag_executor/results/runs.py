@@ -144,7 +144,7 @@ class ExecutorState(TypedDict):
     unattributed: Unattributed
     """Messages of declared callbacks that ran without a job."""
     never_ran: list[str]
-    """Declared callbacks that have not run."""
+    """Declared callbacks of which no execution has begun."""
     not_found: dict[str, str | None]
     """Those of them that no node has, each with a question about its name, or null."""
 
