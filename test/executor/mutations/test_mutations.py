@@ -60,6 +60,8 @@ def get_code(self, name, get=SourceFileLoader.get_code):
 
 if CHANGES := json.loads(os.environ.get('MDDAG_MUTATION', '[]')):
     SourceFileLoader.get_code = get_code
+    # on a busy machine tests wait four times as long, here in vain: longer than HUNG_S
+    os.getloadavg = lambda: (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
