@@ -98,7 +98,7 @@ ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
 """Causes for which a callback waited until a worker was free."""
 WAITS = (*ON_WORKERS, INTERPRETER, GROUP, NEVER_ENDED, PROGRAM)
 """Causes for which a callback waited for others, which are named."""
-DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED}
+DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED, 'withdrawn': DROPPED}
 """By reason of a drop its cause; jobs are aborted because of an earlier miss: they *waited*."""
 NO_MESSAGE = (DROPPED, DESTROYED, NOT_PUBLISHED, LOST)
 """Causes for which a callback never ran."""

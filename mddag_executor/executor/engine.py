@@ -218,6 +218,8 @@ class Engine:
             entity.leave([work])
             return
         release = max(entity.since, min(due, now))
+        if entity.waiting:
+            self._drop_withdrawn(work, now)
         if entity.depth and len(entity.waiting) >= entity.depth:
             entity.skipped += 1
             if entity.source >= 0:
@@ -227,6 +229,13 @@ class Engine:
         else:
             work.due_ns = release
             self.ready(work, now)
+
+    def _drop_withdrawn(self, newest: Work, now: int) -> None:
+        """Drop what waits of a timer that was reset since: else it would be in the way."""
+        self._end_bypass()
+        for x in list(newest.entity.waiting):
+            if self._work[x].n_resets != newest.n_resets:
+                self._drop(newest.entity, x, 'withdrawn', now)
 
     def _is_over(self, dag: int) -> bool:
         """
@@ -884,8 +893,12 @@ class Engine:
         work.entity.dropped += not ran
         self.ask_again()
 
-    def destroyed(self, work: Work, now: int) -> None:
-        """End a dispatched execution that must not run: its job cannot complete any more."""
+    def destroyed(self, work: Work, now: int, reason: str = 'destroyed') -> None:
+        """
+        End a dispatched execution that must not run: its job cannot complete any more.
+
+        :param reason: that of ``Destroyed``.
+        """
         self._end_bypass()
         x, work.x = work.x, -1
         self._let_go(work)
@@ -894,7 +907,7 @@ class Engine:
         self._complete(x, now)
         if self.path_watch is not None:
             self.path_watch.left(work)
-        self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, 'destroyed', now)
+        self.verdicts.dropped(work.entity, work.origin or NO_ORIGIN, reason, now)
         self._decided(now)
         self.ask_again()
 

@@ -113,7 +113,7 @@ class Entity(ChannelSource):
         self.incompatible_qos: str | None = None
         # the topics that its callback has published on
         self.publishes: set[str] = set()
-        # whether it was destroyed; whether that, or ``is_cancelled``, must be checked first
+        # whether it was destroyed; whether that, or ``is_withdrawn``, must be checked first
         self.removed = False
         self.may_be_gone = False
         # whether it holds the interpreter while it runs
@@ -139,7 +139,7 @@ class Entity(ChannelSource):
         self.callback = callback
         self.habit = GilHabit(callback.holds_interpreter)
 
-    def is_cancelled(self) -> bool:
+    def is_withdrawn(self, work: Any) -> bool:
         """Return whether a ready execution must not run any more; its handle is entered."""
         return False
 

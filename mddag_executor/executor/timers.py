@@ -14,6 +14,8 @@ Theory of operation
 3.  *Changes.*  A timer that is due later than expected is found when rcl is asked.  One that is
     due earlier (reset after it was cancelled or its period was shortened) is announced by rcl's
     listener for resets.
+    A reset after a timer was due, and before its callback has started, withdraws the execution
+    (``is_withdrawn``): rclpy's executors ask rcl again just before they run a timer.
 4.  *Simulated time.*  A timer whose clock is overridden has no due time on the monotonic clock.
     rcl is asked after each jump of its clock.
 """
@@ -67,6 +69,7 @@ class TimerEntity(ListenerEntity):
     Its listener announces that it is reset.  The timer of a ``Rate`` is handled at once.
 
     :ivar due: when to ask rcl next (monotonic ns), while its entry in the agenda is not empty.
+    :ivar n_resets: how many resets were noticed; those before it was due do not matter.
     """
 
     kind = 'timer'
@@ -77,19 +80,29 @@ class TimerEntity(ListenerEntity):
 
     __slots__ = (
         'until', 'period', 'last_period', 'due', 'entry', 'simulated', 'may_be_simulated',
-        '_next_call', '_call', '_clock', '_is_steady', '_offset', '_queue', 'allowance',
-        'period_of_allowance')
+        'n_resets', '_next_at', '_next_call', '_call', '_clock', '_is_steady', '_offset',
+        '_queue', 'allowance', 'period_of_allowance')
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
         period = self.rclpy_object.timer_period_ns
         self.depth, self.label = 1, exact_duration(period)
         self.may_be_gone = True
+        self.n_resets = 0
+        self._next_at: int | None = None
         self.declarable = Declarable(self.node, self.kind, '', period)
 
-    def is_cancelled(self) -> bool:
-        """Return whether it was cancelled: it may have become due once more before that."""
-        return bool(self.rclpy_object.is_canceled())
+    def is_withdrawn(self, work: Work) -> bool:
+        """Return whether it was cancelled or reset after it had become due: rclpy checks both."""
+        self._note_reset()
+        return work.n_resets != self.n_resets or bool(self.rclpy_object.is_canceled())
+
+    def _note_reset(self) -> None:
+        """Note whether rcl's next call time was changed since the last call: by a reset."""
+        if self.fd >= 0:
+            at = self._next_call.read()
+            if at != self._next_at:
+                self._next_at, self.n_resets = at, self.n_resets + 1
 
     def record(self, say: Callable[..., None], node: int) -> None:
         """Record it with CARET's tracepoints."""
@@ -109,6 +122,7 @@ class TimerEntity(ListenerEntity):
         self._queue = place.timers
         with self.handle:
             self._next_call = NextCall(self.handle.pointer)
+            self._next_at = self._next_call.read()
         self.until, self._call, self.period = timer_functions(timer)
         self._clock: Any = timer.clock
         self._is_steady = timer.clock.clock_type == ClockType.STEADY_TIME
@@ -162,13 +176,19 @@ class TimerEntity(ListenerEntity):
 
     def call(self) -> Work | None:
         """Let rcl advance it; return its execution, None if it has no callback."""
+        self._note_reset()
         info = self._call()
+        self._next_at = self._next_call.read()
         callback = self.rclpy_object.callback
         if callback is None:
             return None
-        if info is not None:
-            callback = with_timer_info(self.rclpy_object, callback, info)
-        return Work(self, callback)
+        return self.work(with_timer_info(self.rclpy_object, callback, info))
+
+    def work(self, callback: Any) -> Work:
+        """Return an execution, as it is due now."""
+        work = Work(self, callback)
+        work.n_resets = self.n_resets
+        return work
 
 
 class TimerQueue:

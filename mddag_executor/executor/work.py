@@ -95,8 +95,16 @@ class Destroyed(Exception):
     """
     The entity was destroyed after its execution had become ready: it must not run.
 
-    Also raised for a timer that was cancelled.
+    :cvar reason: why the execution is dropped.
     """
+
+    reason = 'destroyed'
+
+
+class Withdrawn(Destroyed):
+    """The program does not want the execution any more: it has cancelled or reset the timer."""
+
+    reason = 'withdrawn'
 
 
 class Work:
@@ -117,6 +125,7 @@ class Work:
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar due_ns: when its timer was due, on the trace's clock; 0: it is of no timer.
+    :ivar n_resets: how many times its timer had been reset when it was due.
     :ivar cpu_ns: its CPU time.
     :ivar coroutine: its ``coroutines.Steps``, if it is one and has begun.
     :ivar paused_ns: for how long it has paused since it was dispatched.
@@ -133,7 +142,7 @@ class Work:
     published: frozenset[str] = frozenset()
     sent: tuple[tuple[str, int], ...] = ()
     x = worker = -1
-    ready_ns = due_ns = cpu_ns = yields = paused_ns = suspended_ns = 0
+    ready_ns = due_ns = cpu_ns = yields = paused_ns = suspended_ns = n_resets = 0
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),
@@ -149,7 +158,7 @@ class Work:
         """
         Run, or continue; return None when it has finished, else what it waits for.
 
-        :param must_check: the entity may be destroyed, or its timer cancelled, by now.
+        :param must_check: the entity may be destroyed, or its timer cancelled or reset, by now.
         :raises Destroyed: if it must not run any more.
         :raises BaseException: the exception of the callback.
         """
@@ -181,9 +190,8 @@ class Work:
             return
         try:
             with entity.handle:
-                # It may have become due once more before its callback cancelled it.
-                if entity.is_cancelled():
-                    raise Destroyed
+                if entity.is_withdrawn(self):
+                    raise Withdrawn
         except InvalidHandle:
             raise Destroyed from None
 

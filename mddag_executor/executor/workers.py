@@ -753,8 +753,8 @@ class WorkerPool:
             is_gone = isinstance(outcome, Destroyed)
             if is_over(self.context):  # this may also destroy nodes
                 engine.left_open(work, start, end, me.vtid, worker, not is_gone)
-            elif is_gone:
-                engine.destroyed(work, now)
+            elif isinstance(outcome, Destroyed):
+                engine.destroyed(work, now, outcome.reason)
             else:
                 engine.finished(work, start, end, now, me.vtid, worker, True)
             if not is_gone and self.callback_ended is None:

@@ -303,8 +303,8 @@ class Loop:
         self._current = execution
         try:
             execution.waits_for = work.run() if entity.gate is None else entity.gate(work)
-        except Destroyed:
-            self.engine.destroyed(work, self.now)
+        except Destroyed as why:
+            self.engine.destroyed(work, self.now, why.reason)
             return False
         except Refused:
             self.engine.refused(work, self.now)

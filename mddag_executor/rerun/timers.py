@@ -21,9 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mddag_executor.executor.compat import alive, ends_sleep, with_timer_info
-from mddag_executor.executor.entity import Entity
-from mddag_executor.executor.timers import ZERO_PERIOD_NS
-from mddag_executor.executor.work import Work
+from mddag_executor.executor.timers import TimerEntity, ZERO_PERIOD_NS
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.loop import Loop, TIMER
 from rclpy.exceptions import InvalidHandle
@@ -34,7 +32,7 @@ from rclpy.timer import Timer
 class _TimerState:
     """A timer: when it is due next (-1: never), and was last."""
 
-    entity: Entity
+    entity: TimerEntity
     last: int
     due: int = -1
 
@@ -58,7 +56,7 @@ class Timers:
         replace(Timer, 'time_until_next_call', instead(self._until_next))
         replace(Timer, 'time_since_last_call', instead(self._since_last))
 
-    def refresh(self, entities: Iterable[Entity]) -> None:
+    def refresh(self, entities: Iterable[TimerEntity]) -> None:
         """Update which timers there are."""
         before, self._known = self._known, {}
         for entity in entities:
@@ -69,7 +67,7 @@ class Timers:
             known.entity = entity
             self._known[entity.rclpy_object] = known
 
-    def _first_due(self, entity: Entity) -> int:
+    def _first_due(self, entity: TimerEntity) -> int:
         now, period = self._loop.now, _period(entity.rclpy_object)
         first = None
         if entity.source >= 0:
@@ -104,7 +102,8 @@ class Timers:
             self._loop.on_ended(timer)
             return
         info = {'expected_call_time': due, 'actual_call_time': now}
-        engine.timer_due(Work(known.entity, with_timer_info(timer, callback, info)), now, now)
+        engine.timer_due(
+            known.entity.work(with_timer_info(timer, callback, info)), now, now)
 
     # --- what nodes do with them -----------------------------------------------------------------
 
@@ -113,6 +112,7 @@ class Timers:
             original(timer)
             known = self._known.get(timer)
             if known is not None:
+                known.entity.n_resets += 1
                 known.last = self._loop.now
                 self._schedule(known, known.last + _period(timer))
 

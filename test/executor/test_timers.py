@@ -179,6 +179,35 @@ def test_a_timer_that_is_reset_before_it_is_due_never_runs_and_costs_no_memory(
     assert not barked
 
 
+@pytest.mark.parametrize('cancels', [False, True], ids=['reset', 'cancelled'])
+@pytest.mark.parametrize('until', ['its turn', 'it is due again'])
+def test_a_timer_that_is_reset_while_its_callback_waits_is_withdrawn(
+        make_executor, make_node, tmp_path, until, cancels):
+    """A watchdog is due while another callback runs, which feeds it: it barks a period later."""
+    node, barked, fed, path = make_node(), [], [], tmp_path / 'run.mcap'
+    watchdog = node.create_timer(
+        0.05, lambda: barked.append(time.monotonic()), autostart=False)
+
+    def work():
+        watchdog.reset()
+        (known,) = registry_of(executor).of_kind(TimerEntity)
+        assert wait_for(lambda: known.waiting)
+        if cancels:
+            watchdog.cancel()
+        watchdog.reset()
+        fed.append(time.monotonic())
+        assert until == 'its turn' or wait_for(lambda: known.dropped)
+
+    node.create_guard_condition(work).trigger()
+    executor = make_executor(nodes=[node], trace=str(path))
+    with Spinning(executor):
+        assert wait_for(lambda: len(barked) >= 2)
+    assert barked[0] - fed[0] > 0.049
+    recording = open_recording(path)
+    assert [recording.names.drop_reasons[each] for each in recording.drops['reason']] == [
+        'withdrawn']
+
+
 @pytest.mark.parametrize('sleeps', [False, True], ids=['timer', 'rate'])
 def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
         make_executor, make_node, sleeps):

@@ -320,6 +320,25 @@ def test_timers_fire_at_their_virtual_times(bag, graph):
     assert seen == [(time, 'first') for time in (30, 60, 90, 120, 620)] + [(1320, 'other')]
 
 
+def test_a_timer_that_is_reset_while_its_callback_waits_does_not_run(bag, graph):
+    def fill(node):
+        def feed():
+            node.note('feed')
+            watchdog.reset()
+
+        def bark():
+            node.note('bark')
+            watchdog.cancel()
+            feeding.cancel()
+
+        feeding = node.create_timer(0.03, feed)
+        watchdog = node.create_timer(0.03, bark)
+        node.create_timer(0.1, feeding.cancel)
+
+    seen, _ = run_filter(bag, graph, fill=fill)
+    assert seen == [(30, 'feed'), (60, 'feed'), (90, 'feed'), (120, 'bark')]
+
+
 def draw():
     """Return random numbers from all that makes any."""
     numbers = [random.random(), random.Random().random(), numpy.random.default_rng().random(),
