@@ -218,7 +218,7 @@ class Engine:
             entity.leave([work])
             return
         release = max(entity.since, min(due, now))
-        if entity.waiting:
+        if work.was_reset and entity.waiting:
             self._drop_withdrawn(work, now)
         if entity.depth and len(entity.waiting) >= entity.depth:
             entity.skipped += 1

@@ -80,15 +80,15 @@ class TimerEntity(ListenerEntity):
 
     __slots__ = (
         'until', 'period', 'last_period', 'due', 'entry', 'simulated', 'may_be_simulated',
-        'n_resets', '_next_at', '_next_call', '_call', '_clock', '_is_steady', '_offset',
-        '_queue', 'allowance', 'period_of_allowance')
+        'n_resets', '_n_before', '_next_at', '_next_call', '_call', '_clock', '_is_steady',
+        '_offset', '_queue', 'allowance', 'period_of_allowance')
 
     def describe(self) -> None:
         """Set label, depth and whatever else does not change."""
         period = self.rclpy_object.timer_period_ns
         self.depth, self.label = 1, exact_duration(period)
         self.may_be_gone = True
-        self.n_resets = 0
+        self.n_resets = self._n_before = 0
         self._next_at: int | None = None
         self.declarable = Declarable(self.node, self.kind, '', period)
 
@@ -187,7 +187,8 @@ class TimerEntity(ListenerEntity):
     def work(self, callback: Any) -> Work:
         """Return an execution, as it is due now."""
         work = Work(self, callback)
-        work.n_resets = self.n_resets
+        work.was_reset = self.n_resets != self._n_before
+        work.n_resets = self._n_before = self.n_resets
         return work
 
 

@@ -126,6 +126,7 @@ class Work:
     :ivar ready_ns: when it became ready, on the trace's clock.
     :ivar due_ns: when its timer was due, on the trace's clock; 0: it is of no timer.
     :ivar n_resets: how many times its timer had been reset when it was due.
+    :ivar was_reset: whether its timer was reset since it had been due before.
     :ivar cpu_ns: its CPU time.
     :ivar coroutine: its ``coroutines.Steps``, if it is one and has begun.
     :ivar paused_ns: for how long it has paused since it was dispatched.
@@ -134,6 +135,7 @@ class Work:
     """
 
     # defaults of the class: most executions never set some of them
+    was_reset = False
     coroutine: Any = None
     origin: Origin | None = None
     answers: Origin | None = None
