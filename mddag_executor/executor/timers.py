@@ -94,15 +94,16 @@ class TimerEntity(ListenerEntity):
 
     def is_withdrawn(self, work: Work) -> bool:
         """Return whether it was cancelled or reset after it had become due: rclpy checks both."""
-        self._note_reset()
+        if self.fd >= 0 and self._next_call.read() != self._next_at:
+            with self.rooms.pool.lock:  # else it may just be called once more
+                self._note_reset()
         return work.n_resets != self.n_resets or bool(self.rclpy_object.is_canceled())
 
     def _note_reset(self) -> None:
         """Note whether rcl's next call time was changed since the last call: by a reset."""
-        if self.fd >= 0:
-            at = self._next_call.read()
-            if at != self._next_at:
-                self._next_at, self.n_resets = at, self.n_resets + 1
+        at = self._next_call.read()
+        if at != self._next_at:
+            self._next_at, self.n_resets = at, self.n_resets + 1
 
     def record(self, say: Callable[..., None], node: int) -> None:
         """Record it with CARET's tracepoints."""
