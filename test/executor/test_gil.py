@@ -498,7 +498,9 @@ def test_a_task_holds_the_gil_if_its_function_does(make_executor, make_node, is_
     with Spinning(executor):
         for _ in range(200):
             tasks = executor.create_task(function), executor.create_task(time.sleep, 0.005)
-            assert wait_for(lambda tasks=tasks: all(task.done() for task in tasks))
+            # they are measured after they are done
+            assert wait_for(lambda tasks=tasks: all(task.done() for task in tasks)
+                            and is_idle(executor))
             if habit.is_known and habit.holds:
                 break
         is_long.set()
