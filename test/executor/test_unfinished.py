@@ -249,7 +249,7 @@ def test_a_coroutine_that_has_slept_waits_for_a_worker(
         where = [each['where'] for each in executor.statistics()['unfinished']
                  if 'sleep' in each['callback']]
         assert len(where) == 1 and where[0].endswith(', waits for a future')
-        assert executor._diagnostics._pool.status(0).level == 1
+        assert wait_for(lambda: executor._diagnostics._pool.status(0).level == 1)
         seen = len(notes)
         assert wait_for(lambda: notes[seen:].count(2) > 1)
         let_go.set()
