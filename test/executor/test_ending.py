@@ -230,13 +230,21 @@ def test_too_many_open_files_leave_nothing_behind(
     MultiDeadlineExecutor(context=ros_context).shutdown()
     unraisable, limits, errors = [], resource.getrlimit(LIMIT), 0
     monkeypatch.setattr(sys, 'unraisablehook', unraisable.append)
-    # no number of a descriptor is free that is less than another one's
+    gc.collect()
     highest, fillers = max(map(int, os.listdir('/proc/self/fd'))), [os.open(os.devnull, 0)]
-    while fillers[-1] <= highest:
-        fillers.append(os.open(os.devnull, 0))
+
+    def fill_gaps():
+        """Let no number of a descriptor be free that is less than another one's."""
+        while fillers[-1] <= highest:
+            fillers.append(os.open(os.devnull, 0))
+
+    fill_gaps()
     request.addfinalizer(lambda: [os.close(each) for each in fillers])
     before = used()
     for more in range(40):
+        fillers.append(os.open(os.devnull, 0))
+        fill_gaps()     # of what earlier tests have left, and has ended by now
+        os.close(fillers.pop())
         resource.setrlimit(LIMIT, (before[1] + more, limits[1]))
         try:
             executor = MultiDeadlineExecutor(
