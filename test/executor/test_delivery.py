@@ -131,8 +131,8 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
     # On a busy machine there are too many foreign ones: they have time, and no job ends before.
     executor = make_executor(loads(graph(here="""
         name: tick, timer: 2ms, publishes: [/a]
-        name: hear, subscription: /a, deadline: 10s""")), num_workers=2, nodes=[node, plain],
-        default_deadline='10s', max_active_jobs=5000)
+        name: hear, subscription: /a, deadline: 60s""")), num_workers=2, nodes=[node, plain],
+        default_deadline='60s', max_active_jobs=5000)
     with Spinning(executor):
         matched(publisher, count=2)
         with subprocess.Popen([sys.executable, '-c', FOREIGN]) as foreign:
