@@ -528,9 +528,9 @@ class Engine:
         :param others_wait: whether a thread waits for events, which can start more at once.
         """
         step, bypass = self._step, self._bypass
+        step.overtaken = ()
         if not (self._ready or self._deferred or bypass.queue):  # nearly every second time
             step.work = None
-            step.overtaken = ()
             step.more = False
             step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
             return step
@@ -539,7 +539,6 @@ class Engine:
         is_short = False
         if work is not None:
             is_short = step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
-        step.overtaken = ()
         if len(self._holders) > 1:
             self.interpreter.reorder()
             if self.interpreter.pauses:

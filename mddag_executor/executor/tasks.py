@@ -245,17 +245,17 @@ def make_task(
     :param unclaimed: receives the task with its exception when it has ended.
     :param loops: returns the event loops of coroutines; None: there are none.
     """
-    steps = None
+    steps, starter = None, starter_here()
     if inspect.iscoroutinefunction(callback):
         callback, args, kwargs = callback(*args, **kwargs), (), {}
     if inspect.iscoroutine(callback):
         from mddag_executor.executor.coroutines import Steps  # with asyncio, when it is needed
         steps = Steps(callback, None if loops is None else loops())
-        set_starter(steps.get_context(), starter_here())
+        set_starter(steps.get_context(), starter)
         callback = steps.as_coroutine()
     task = ObservedTask(callback, args, kwargs, executor=executor)
     work = TaskWork(entity, task)
-    work.coroutine, work.starter = steps, starter_here()
+    work.coroutine, work.starter = steps, starter
     work.then = unclaimed.ended
     if steps is not None:
         Future.add_done_callback(task, QuickCallback(partial(resume, work)))  # not an observer

@@ -166,7 +166,7 @@ class Entities:
         """Note a complete event."""
         pid, time = f['_vpid'], f['_timestamp']
         if name == 'rcl_node_init':
-            node = Node(pid, f'{f["namespace"].rstrip("/")}/{f["node_name"]}', time)
+            node = Node(pid, full_name(f['namespace'], f['node_name']), time)
             self.nodes.add(pid, f['node_handle'], time, node)
             self.names.nodes[node.name] = None
         elif name == 'rcl_publisher_init':
@@ -272,6 +272,11 @@ class Entities:
                 f'callback {found.number} of process {pid}, whose start is not recorded')
             self.callbacks.add(pid, address, time, found)
         return found
+
+def full_name(namespace: str, name: str) -> str:
+    """Return the full name of a node."""
+    return f'{namespace.rstrip("/")}/{name}'
+
 
 def signed(address: int) -> int:
     """Return an address as a signed 64-bit number, as in columns."""

@@ -74,6 +74,11 @@ Event = tuple[Any, ...]
 Progress = Callable[[int], None]
 
 
+def progress_from(progress: Progress | None, before: int) -> Progress | None:
+    """Return what is called with the number of events read of one recording of several."""
+    return None if progress is None else lambda more: progress(before + more)
+
+
 def label_of(path: str) -> str:
     """Return the name of a trace's process: `up` of `run.up.mcap`, `up.2` of `run.up.2.mcap`."""
     rest, _, word = os.path.basename(path).removesuffix('.mcap').rpartition('.')
@@ -124,7 +129,7 @@ class _Part:
         """Read its tables, with joined addresses and ``workers`` (rule 2), by its own clock."""
         found = self.found = read_process(
             self.reader, self.name, self.head, task_set, who, self._edited,
-            None if progress is None else lambda more: progress(count + more))
+            progress_from(progress, count))
         tables = found.tables
         self.seen_at = found.seen_at
         for addresses in (

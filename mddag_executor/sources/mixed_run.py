@@ -45,6 +45,7 @@ from mddag_executor.recording.losses import Loss
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import FAILED, JOB_ENDS, NOTHING
 from mddag_executor.sources.declared_events import DeclaredEvents
+from mddag_executor.sources.entities import full_name
 from mddag_executor.sources.head import damage, declared, named_errors, no_run, read_head, steps
 from mddag_executor.sources.imported_events import (
     Events,
@@ -57,7 +58,7 @@ from mddag_executor.sources.imported_events import (
     START,
 )
 from mddag_executor.sources.imported_run import hosts_in, ImportedRun, OFF_THE_GRID
-from mddag_executor.sources.joining import label_of
+from mddag_executor.sources.joining import label_of, progress_from
 from mddag_executor.sources.undeclared_run import CLOCK_STEP, UndeclaredRun
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
@@ -215,7 +216,7 @@ class MixedRun(UndeclaredRun):
         several: list[Events] = []
         count = 0
         for part in self._parts:
-            several.append(part.read(_progress_from(progress, count)))
+            several.append(part.read(progress_from(progress, count)))
             count += part.reader.message_count or 0
         several = self._convert_clocks(self._without_duplicates(several))
         self._check_run(several)
@@ -452,13 +453,6 @@ class MixedRun(UndeclaredRun):
                     'is cut): the run goes on without it'))
 
 
-def _progress_from(
-    progress: Function[[int], None] | None, before: int
-) -> Function[[int], None] | None:
-    """Return what is called with the number of events read of a recording."""
-    return None if progress is None else lambda more: progress(before + more)
-
-
 def _field(event: Event, name: str) -> int:
     """Return a number of an event; 0: it has none."""
     value = dict(zip(event[0].fields, event[4:])).get(name)
@@ -472,7 +466,7 @@ def _nodes(events: Events) -> dict[int, set[str]]:
         if layout.name == _NODE:
             fields = dict(zip(layout.fields, values))
             found.setdefault(pid, set()).add(
-                f'{fields.get("namespace")}/{fields.get("node_name")}'.replace('//', '/'))
+                full_name(str(fields.get('namespace')), str(fields.get('node_name'))))
     return found
 
 
