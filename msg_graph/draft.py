@@ -14,7 +14,9 @@ which is an entry once its first ``# `` is removed. While blanks are open, they 
 the declaration (``open_blanks``), since most others follow from them:
 
 1. *deadline* of a sink: the shortest period of the sources that lead to it; none, if it only
-   stores a message, and is not the only result of its DAG.
+   stores a message, and is not the only result of its DAG.  For a source without a fixed rate it
+   is the mean time between two executions: the least one, which is its period, is arbitrarily
+   short if messages or requests come from several publishers or clients.
 2. *period* of a service, and of a subscription whose topic no callback publishes: the measured
    time between two of its executions, if there is one.
 3. *publishes*, if it is unknown which of a node's callbacks publishes a topic: on each that may.
@@ -119,6 +121,13 @@ class DraftCallback:
         if self.came_once and self.period_ns is None:
             return SECOND
         return self.period_ns or self.least_interval_ns or self.interval_ns
+
+    @property
+    def usual_interval_ns(self) -> int | None:
+        """Return the usual time between two releases if this is a source, if known."""
+        if self.period_ns is None and self.least_interval_ns is not None:
+            return max(self.least_interval_ns, self.interval_ns or 0)
+        return self.source_period_ns
 
 
 @dataclass
@@ -276,10 +285,10 @@ class _Writer:
         return _is_source(callback, self._perhaps_published)
 
     def _fastest_sources(self) -> dict[str, DraftCallback]:
-        """Return by callback the source with the shortest period that may lead to it."""
+        """Return by callback the source with the shortest usual interval that may lead to it."""
         found: dict[str, DraftCallback] = {}
-        sources = [c for c in self._callbacks if self._is_source(c) and c.source_period_ns]
-        for source in sorted(sources, key=lambda c: c.source_period_ns or 0):
+        sources = [c for c in self._callbacks if self._is_source(c) and c.usual_interval_ns]
+        for source in sorted(sources, key=lambda c: c.usual_interval_ns or 0):
             stack = [source]
             while stack:
                 callback = stack.pop()
@@ -451,11 +460,13 @@ class _Writer:
         source = self._fastest.get(callback.key)
         if source is None:
             return _blank('deadline: 100ms', f'{what}; no source with a known period leads here')
-        period = (_rounded(source.source_period_ns or 0) if source.period_ns is None
-                  else _whole(source.period_ns))
+        usual = (_rounded(source.usual_interval_ns or 0) if source.period_ns is None
+                 else _whole(source.period_ns))
         kind = 'timer' if source.kind == 'timer' else 'source'
-        return self._proposal(
-            f'deadline: {period}', what, f'the period of the {kind} that leads here')
+        is_mean = source.period_ns is None and source.least_interval_ns is not None
+        return self._proposal(f'deadline: {usual}', what, (
+            'the mean measured time between two executions' if is_mean else 'the period')
+            + f' of the {kind} that leads here')
 
     def _paths(self) -> Iterator[str]:
         found = [(path, self._path_keys(path)) for path in self._draft.paths]

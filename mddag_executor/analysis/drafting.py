@@ -19,9 +19,11 @@ Theory of operation
    If none were received, every callback of the node may publish it; for a node without callbacks
    a timer is assumed.
 5. A service without calls, and a subscription without messages whose topic no callback publishes,
-   have no rate, so they cannot be the source of a DAG.  They are left out and reported.
+   have no rate, so they cannot be the source of a DAG.  They are left out and reported, and take
+   no name from those that ran.  So is a timer that never fired in ``NEVER_PERIODS`` periods.
 6. A timer that was made after another one of its node, with the same period and function, had
-   fired, is the same callback, made again (``sporadic``).  So is a timer that was reset: its due
+   fired, or that never fired although a period had passed (it was destroyed or cancelled before),
+   is the same callback, made again (``sporadic``).  So is a timer that was reset: its due
    times are not whole periods apart, or the only one is much later than a period after it was
    made.
 7. Subscriptions of a node are one sync (``_find_syncs``) if the messages that they publish have
@@ -183,8 +185,7 @@ class System:
                 entity.symbol if declared is None else declared.name), entity)
             runs, again = (self._runs.get(each.number) for each in (before, entity))
             if before is entity or declared is None and (
-                    not entity.symbol or runs is None
-                    or entity.made <= int(runs.starts.max(initial=0))):
+                    not entity.symbol or not self._was_gone(before, entity.made)):
                 continue
             self._entities.remove(entity)
             self._made_again.add(before.number)
@@ -197,6 +198,23 @@ class System:
                         for topic in {**runs.published, **again.published}})
             if again is not None:
                 self._runs[before.number] = again
+
+    def _was_gone(self, timer: Callback, at: int) -> bool:
+        """Return whether a timer had ended, or had been cancelled, before a time (rule 6)."""
+        runs = self._runs.get(timer.number)
+        if runs is not None and len(runs.starts):
+            return at > int(runs.starts.max())
+        return self._end - timer.made > (1 + RESET_SHARE) * timer.period + _MADE_NS
+
+    def _is_silent(self, entity: Callback) -> bool:
+        """Return whether an entity may be left out because it never ran (rule 5)."""
+        runs = self._runs.get(entity.number)
+        return (runs is None or not len(runs.starts)) and entity.number not in self._declared and (
+            entity.kind != 'timer' or self._never_fires(entity.period))
+
+    def _never_fires(self, period: int) -> bool:
+        """Return whether the recording is so long that a timer that has not fired never does."""
+        return self._length > NEVER_PERIODS * min(period, DAY)
 
     def _find_headers(self, recording: Recording) -> None:
         """Find the header stamps of messages: by topic, and of the executions of callbacks."""
@@ -238,7 +256,7 @@ class System:
     def draft(self) -> Draft:
         """Return the whole system."""
         nodes: dict[str, DraftNode] = {}
-        for entity in self._entities:
+        for entity in sorted(self._entities, key=self._is_silent):  # names go to those that ran
             node = nodes.setdefault(entity.node_name, DraftNode(entity.node_name))
             callback = self._callback(entity, node)
             node.callbacks.setdefault(callback.name, callback)
@@ -270,7 +288,7 @@ class System:
             'it never ran')
         leave_out_sources(draft, lambda callback: (
             callback.runs == 0 and callback.kind == 'timer' and callback.key not in declared
-            and self._length > NEVER_PERIODS * (callback.period_ns or DAY)),
+            and self._never_fires(callback.period_ns or DAY)),
             'it never fired, so it was cancelled, or reset each time before')
         draft.processes = self._processes([node.name for node in draft.nodes if node.callbacks])
         return draft

@@ -25,12 +25,8 @@ def recorded_system(*paths: str) -> System:
     from mddag_executor.analysis.drafting import System
     given = common.one_run(paths, ())
     with Progress('reading the trace') as line:
-        if isinstance(given, str) and given != '-' and Path(given).is_dir():
+        if isinstance(given, str) and given != '-' and _is_session(given):
             from mddag_executor.trace import import_ctf
-            from mddag_executor.trace.reader import no_trace
-            traces = any(Path(given).glob('*.mcap')) or not any(Path(given).iterdir())
-            if traces and not any(Path(given).rglob('metadata')):
-                raise no_trace(given)
             with tempfile.TemporaryDirectory(prefix='mddag-') as folder:
                 trace = Path(folder, 'session.mcap')
                 warnings = import_ctf(given, trace, progress=line.events).warnings
@@ -40,6 +36,14 @@ def recorded_system(*paths: str) -> System:
             system = System(*common.input_path(given), line.events)
     warn(*system.warnings)
     return system
+
+
+def _is_session(path: str) -> bool:
+    """Return whether a path is a folder that LTTng recorded to, or what CARET has left of one."""
+    from mddag_executor.trace.ctf import CARET_CACHE
+    folder = Path(path)
+    return folder.is_dir() and (
+        any(folder.rglob('metadata')) or folder.joinpath(CARET_CACHE).exists())
 
 
 def write_declaration(output: str, text: str) -> None:

@@ -94,6 +94,12 @@ def _of_several(
     paths = [os.fspath(each) for each in traces.paths]
     if len(paths) == 1 and not traces.offsets:
         return open_recording(paths[0], task_set, progress=progress)
+    from mddag_executor.sources.kinds import is_ordinary
+    for path in paths:
+        if is_ordinary(path):
+            raise ReplayError(
+                path, 'it is an ordinary bag, which has no executions to join with those of '
+                'traces', 'give the traces of the processes of one run')
     if all(read_head(TraceReader(path)) is not None for path in paths):
         from mddag_executor.sources.joining import Joined
         return judged_by(Joined(paths, traces.offsets).recording(progress), task_set)
@@ -107,9 +113,20 @@ def _of_several(
 def open_to_draft(
     path: str | os.PathLike[str] | Traces, name: str, progress: Progress | None = None
 ) -> Recording:
-    """Read a trace to draft a declaration, by the recorded one, if any; see ``open_recording``."""
+    """
+    Read a trace to draft a declaration, by the recorded one, if any; see ``open_recording``.
+
+    :raises mddag_executor.ReplayError: as ``open_recording`` does, and for a bag, which has nothing
+        to draft from.
+    """
     if isinstance(path, Traces):    # of a declared run
         return open_recording(path, None, name, progress)
+    from mddag_executor.sources.kinds import is_ordinary
+    if is_ordinary(os.fspath(path)):
+        raise ReplayError(
+            name, 'it is an ordinary bag: it has messages, but nothing in it says which callbacks '
+            'received them', 'record the nodes with mddag run … --trace FILE, CARET or '
+            'ros2_tracing')
     with named_errors(os.fspath(path), name):
         reader = TraceReader(path)
         head = read_head(reader)

@@ -78,7 +78,7 @@ from mddag_executor.trace.trace_file import TraceFile, whole_trace
 from mddag_executor.trace.tsdl import parse_tsdl
 import numpy as np
 
-_CACHE = 'caret_converted'
+CARET_CACHE = 'caret_converted'
 _RECORD = 'check the recording, or record it again'
 _LOST = 'mddag:lost'
 
@@ -217,8 +217,8 @@ def _session_in(path: str) -> _Session:
     folders = sorted(folder for folder, _, names in os.walk(path) if 'metadata' in names)
     if not folders:
         what = 'holds no CTF recording (no file called metadata is in it or below)'
-        if os.path.exists(os.path.join(path, _CACHE)):
-            what = f'holds only what CARET converted ({_CACHE}), not the recording itself'
+        if os.path.exists(os.path.join(path, CARET_CACHE)):
+            what = f'holds only what CARET converted ({CARET_CACHE}), not the recording itself'
         raise TraceError(path, what, remedy)
     sessions = set()
     for folder in folders:

@@ -189,6 +189,78 @@ def test_what_comes_when_it_is_needed_is_sporadic(tmp_path):
         '/plan', 1_000 * MS, True, 1_000 * MS)
 
 
+def test_two_clients_of_a_service_do_not_give_it_a_tiny_deadline(tmp_path):
+    """Requests of both come together: the least time between two says nothing of deadlines."""
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(300, '/planner')
+    r.timer(1, 300, 50 * MS)
+    service(r, 260, 300, '/plan')
+    r.publisher(110, 300, '/path')
+    r.node(400, '/drive')
+    r.subscription(430, 400, '/path')
+    for k in range(40):
+        at = 1_000 * MS + 100 * MS * k
+        ran(r, 1, 1, at, MS)
+        for after in (0, 10_000):       # each of the two sends a request each 100 ms
+            ran(r, 261, 2, at + after, 5_000, 110)
+            ran(r, 430, 3, at + after + 2_000, 1_000_000)
+    draft = System(r.write()).draft()
+    text = declaration_of(draft)
+    assert 'period: 10us' in text and 'deadline: 10us' not in text
+    accept(draft)
+    drive, plan = (each for each in loads(declaration_of(draft, accepted=True)).callbacks
+                   if each.kind != 'timer')
+    assert plan.period_ns == 10_000 and plan.sporadic
+    assert 49 * MS < drive.deadline_ns < 52 * MS
+
+
+def lifecycle(path, second_period, symbol='robot.Driver.tick'):
+    """Write a timer that was destroyed before it fired, and the one that was made after it."""
+    r = Recorded(path)
+    r.node(100, '/driver')
+    for number, period, made in ((1, 100 * MS, 500 * MS), (2, second_period, 530 * MS)):
+        r.timer(number, 100, period, time=made)
+        r.add('ros2:rclcpp_callback_register', made, 1, number, symbol)
+    for k in range(60):
+        ran(r, 2, 1, 700 * MS + second_period * k, MS)
+    return r.write()
+
+
+def test_a_timer_that_was_destroyed_before_it_fired_is_made_again(tmp_path):
+    """A lifecycle node that was configured, cleaned up and configured again."""
+    draft = System(lifecycle(tmp_path / 'n.mcap', 100 * MS)).draft()
+    assert draft.left_out == []
+    accept(draft)
+    tick, = loads(declaration_of(draft, accepted=True)).callbacks
+    assert (tick.name, tick.period_ns, tick.sporadic) == ('tick', 100 * MS, True)
+
+
+@pytest.mark.parametrize('symbol, name', [
+    ('robot.Driver.tick', 'tick'), ('robot.make.<locals>.<lambda>', 'callback_0')])
+def test_what_never_ran_takes_no_name_from_what_did(tmp_path, symbol, name):
+    """The timer got another period, as from a parameter, when it was made again."""
+    draft = System(lifecycle(tmp_path / 'n.mcap', 50 * MS, symbol)).draft()
+    left, = draft.left_out
+    assert 'it never fired' in left and f'/driver:{name} ' not in left
+    accept(draft)
+    tick, = loads(declaration_of(draft, accepted=True)).callbacks
+    assert (tick.name, tick.period_ns, tick.sporadic) == (name, 50 * MS, False)
+
+
+def test_two_timers_that_are_not_yet_due_are_two(tmp_path):
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(100, '/driver')
+    r.timer(3, 100, 10 * MS)
+    for number in (1, 2):
+        r.timer(number, 100, 5_000 * MS)
+        r.add('ros2:rclcpp_callback_register', 0, 1, number, 'robot.Driver.save')
+    for k in range(50):
+        ran(r, 3, 1, 1_000 * MS + 10 * MS * k, MS)
+    text = declaration_of(System(r.write()).draft())
+    assert re.findall(r'name: (.*)', text) == ['callback_0', 'save', 'save_2']
+    assert 'sporadic' not in text
+
+
 def test_what_a_thread_of_a_node_publishes_comes_from_no_callback(tmp_path):
     """A main loop that sleeps with a Rate, for instance: its subscriber is a source."""
     r = Recorded(tmp_path / 'n.mcap')
