@@ -116,8 +116,8 @@ def open_to_draft(
     """
     Read a trace to draft a declaration, by the recorded one, if any; see ``open_recording``.
 
-    :raises mddag_executor.ReplayError: as ``open_recording`` does, and for a bag, which has nothing
-        to draft from.
+    :raises mddag_executor.ReplayError: as ``open_recording`` does, and for a bag, which has
+        nothing to draft from.
     """
     if isinstance(path, Traces):    # of a declared run
         return open_recording(path, None, name, progress)
