@@ -538,7 +538,10 @@ def test_workers_that_wait_for_a_callback_do_not_keep_it_waiting(make_executor, 
             lending.start(name)
         of_program.start()
         lending.bell.set()
-        assert wait_for(lambda: is_idle(lending.executor))
+        try:
+            assert wait_for(lambda: is_idle(lending.executor))
+        finally:
+            lending.leave.set()
     of_program.join()
     assert lending.ran[3:] == ['goes on', 'ends']
 

@@ -32,9 +32,9 @@ from .inside import engine_of, pool_of, registry_of
 MS = 1_000_000
 
 
-def run_in(make_executor, make_node, text, processes, named=True):
+def run_in(make_executor, make_node, text, processes, named=True, bodies=None):
     """Run 20 jobs or more over several executors, as in processes; return nodes and executors."""
-    nodes = Declared(make_node, text, reentrant=False)
+    nodes = Declared(make_node, text, bodies, reentrant=False)
     if named:
         text += 'processes:\n' + ''.join(
             f'  {name}: [{", ".join("/" + node for node in here.split())}]\n'
@@ -99,7 +99,8 @@ def ends(executor):
 
 def test_a_job_goes_on_in_another_executor_with_its_stamp_as_release(make_executor, make_node):
     nodes, (up, down) = run_in(
-        make_executor, make_node, CHAIN, {'up': 'sensor first', 'down': 'second last'}, False)
+        make_executor, make_node, CHAIN, {'up': 'sensor first', 'down': 'second last'}, False,
+        {'first': lambda: time.sleep(0.005)})   # messages arrive later than their stamps
     n = len(nodes.ran['tick'])
     for name in ('second', 'sink'):
         assert [each.job.job for each in nodes.ran[name]] == list(range(n))

@@ -165,7 +165,8 @@ client.completed = getattr(client, 'completed', 0) + 1
         'test_gil.py', 'test_a_task_holds_the_gil_if_its_function_does[False]',
         'test_a_task_holds_the_gil_if_its_function_does[True]'), every=True),
     Case('those_that_go_on_wait_for_ever', [(
-        'executor/lending.py', 'self._go_on_without(work)', 'pass')], of(
+        'executor/lending.py', 'elif work in self.rejoining and seen == (before[0], True):',
+        'elif False:')], of(
         'test_gil.py', 'test_workers_that_wait_for_a_callback_do_not_keep_it_waiting')),
     Case('what_bypasses_the_core_stays_unknown', [(
         'executor/engine.py', 'self._start_next(running.worker, since)', 'pass')],
@@ -385,7 +386,7 @@ awaiting.named(
     Case('threads_publish_for_executions_that_have_ended', [(
         'executor/starters.py', 'if work.x < 0 or topic', 'if topic')], of(
         'test_starters.py',
-        'test_what_is_published_otherwise_belongs_to_no_job_and_is_named[a_thread_that_goes_on]')),
+        'test_what_is_published_otherwise_belongs_to_no_job_and_is_named[a_task_that_goes_on]')),
     Case('threads_of_pools_publish_for_the_one_that_made_them', [(
         'executor/starters.py', 'if not _calling.is_submitting and', 'if')], of(
         'test_starters.py',
