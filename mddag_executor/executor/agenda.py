@@ -8,6 +8,7 @@ All times are ns of the monotonic clock. ``NEVER`` is later than all of them: no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from heapq import heapify, heappop, heappush
 from typing import Any, Protocol
 
@@ -35,12 +36,13 @@ class Agenda:
     callback computes, no thread waits, and it is enough to notice each until its latest time.  All
     methods need one lock.
 
-    :ivar next: a time at or before that of the next appointment (``first``).
-    :ivar latest: a time at or before that until which one must be noticed (``first_latest``).
+    :ivar next: when the next appointment is due.
+    :ivar latest: until when one must be noticed.
     """
 
     def __init__(self) -> None:
-        # an appointment that is cancelled empties its entry, which both heaps refer to
+        # An appointment that is cancelled empties its entry, which both heaps refer to.  The first
+        # entry of neither heap is empty, except in ``handle``.
         self._heap: list[tuple[int, int, list[Any]]] = []
         self._latest: list[tuple[int, int, list[Any]]] = []
         self._entries = 0
@@ -54,9 +56,8 @@ class Agenda:
     def set(self, appointment: Appointment, at: int, latest: int) -> None:
         """Set an appointment, which may be set already, for a time."""
         if appointment.entry:
-            appointment.entry.clear()
-        else:
-            self._appointments += 1
+            self.cancel(appointment)
+        self._appointments += 1
         number = self._entries = self._entries + 1
         entry = appointment.entry = [appointment]
         heappush(self._heap, (at, number, entry))
@@ -76,44 +77,40 @@ class Agenda:
         if appointment.entry:
             appointment.entry.clear()
             self._appointments -= 1
+            self._note_first()
 
-    def first(self) -> int:
-        """Return when the next appointment is due."""
+    def _note_first(self) -> None:
+        """Remove cancelled entries from the front, and note the first times."""
         heap = self._heap
         while heap and not heap[0][2]:
             heappop(heap)
         self.next = heap[0][0] if heap else NEVER
-        return self.next
-
-    def first_latest(self) -> int:
-        """Return until when the next appointment must be noticed."""
         heap = self._latest
         while heap and not heap[0][2]:
             heappop(heap)
         self.latest = heap[0][0] if heap else NEVER
-        return self.latest
 
-    @property
-    def last(self) -> int:
-        """Return the number of the last entry, for ``handle_next``."""
-        return self._entries
-
-    def handle_next(self, now: int, last: int) -> bool:
+    def handle(self, clock: Callable[[], int]) -> None:
         """
-        Let the next appointment come due, if it is due now; return whether there was one.
+        Let each appointment come due that is due, in order, except what is set meanwhile.
 
-        :param last: what was set after this entry counts as not due yet.
+        :param clock: returns the time.
         """
-        heap = self._heap
-        while heap and heap[0][0] <= now and heap[0][1] <= last:
-            _, _, entry = heappop(heap)
-            if entry:
-                appointment: Appointment = entry.pop()
-                self._appointments -= 1
-                appointment.come_due()
-                return True
-        self.next = heap[0][0] if heap else NEVER
-        return False
+        last = self._entries
+        try:
+            while self._heap:  # another list after many changes
+                at, number, entry = self._heap[0]
+                if entry:
+                    if number > last or at > clock():
+                        break
+                    appointment: Appointment = entry.pop()
+                    self._appointments -= 1
+                    heappop(self._heap)
+                    appointment.come_due()
+                else:
+                    heappop(self._heap)
+        finally:
+            self._note_first()
 
 
 def _without_cancelled(heap: list[tuple[int, int, list[Any]]]) -> list[tuple[int, int, list[Any]]]:

@@ -59,9 +59,7 @@ class AtOnce:
             with self.pool.lock:
                 if self.timers.has_jumped:
                     self.timers.ask_after_jump()
-                last = self.agenda.last
-                while self.agenda.handle_next(monotonic_ns(), last):
-                    pass
+                self.agenda.handle(monotonic_ns)
             fired = self._fired[:]
             self._fired.clear()
             for work, *_ in fired:
@@ -70,7 +68,7 @@ class AtOnce:
                     self.count(work.entity)
                 else:  # it had no callback at first, and is not that of a Rate
                     self.pool.post([work])
-        due = self.agenda.next  # not ``first``, which needs the lock
+        due = self.agenda.next
         if due != self.loop.timer.at:
             self.loop.timer.arm(due)
         return self.has_run

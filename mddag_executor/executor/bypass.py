@@ -41,20 +41,22 @@ class Bypass:
     :ivar is_open: whether short undeclared callbacks run past the core now.
     :ivar queue: those that wait.
     :ivar running: the one that runs; None: there is none.
+    :ivar n_entered: how many have waited here so far.
     """
 
-    __slots__ = ('is_open', 'queue', 'running', '_running_since', '_last_id')
+    __slots__ = ('is_open', 'queue', 'running', '_running_since', 'n_entered')
 
     def __init__(self) -> None:
         self.is_open = False
         self.queue: deque[Work] = deque()
         self.running: Work | None = None
         self._running_since = 0
-        self._last_id = -1
+        self.n_entered = 0
 
     def enter(self, work: Work) -> None:
         """Let an execution wait."""
-        x = work.x = self._last_id = self._last_id - 1
+        self.n_entered += 1
+        x = work.x = -1 - self.n_entered
         entity = work.entity
         entity.waiting[x] = None
         entity.ready += 1
@@ -62,11 +64,13 @@ class Bypass:
 
     def start(self, worker: int, now: int) -> Work | None:
         """Start the first one that waits; None: it is to start by way of the core."""
-        entity = self.queue[0].entity
+        work = self.queue[0]
+        entity = work.entity
         if self.running is not None or entity.wall_ns > SHORT_CALLBACK_NS or (
                 entity.gate is not None):
             return None
-        work = self.running = self.queue.popleft()
+        self.queue.popleft()
+        self.running = work
         self._running_since = now
         del entity.waiting[work.x]
         work.x = -1

@@ -88,13 +88,13 @@ class Overdue:
     def __init__(self, pool: Clocked) -> None:
         self.entry: list[Any] | None = None
         self._pool = pool
-        self._engine = pool.engine
+        self._deadlines = pool.engine.deadlines
         #: ns on the trace's clock
         self.deadline = NEVER
 
     def update(self) -> None:
         """Set it to what it is now, or cancel it."""
-        deadline = self._engine.next_deadline()
+        deadline = self._deadlines.first()
         if deadline == self.deadline:
             return
         self.deadline = deadline
@@ -123,7 +123,7 @@ class DueTimes:
     def __init__(self, pool: Clocked) -> None:
         self._pool = pool
         self._agenda = pool.agenda
-        self._interpreter = pool.engine.interpreter
+        self._holders = pool.engine.interpreter.holders
         self._timer = pool.loop.timer
         self._watch = pool.parking.watch
         self._timers = pool.timers
@@ -172,9 +172,7 @@ class DueTimes:
         self._timer.at = NEVER
         if self._timers.has_jumped:
             self._timers.ask_after_jump()
-        last = agenda.last
-        while agenda.handle_next(monotonic_ns(), last):
-            pass
+        agenda.handle(monotonic_ns)
 
     # --- the timerfd of the thread that waits for events -----------------------------------------
 
@@ -189,8 +187,7 @@ class DueTimes:
             self._timer.arm(NEVER)
         else:
             self.check.note(now)
-            first = (
-                self._agenda.first_latest() if self._interpreter.holders else self._agenda.first())
+            first = self._agenda.latest if self._holders else self._agenda.next
             if first != self._timer.at:
                 self._timer.arm(first)
 
@@ -201,18 +198,18 @@ class DueTimes:
         The caller starts nothing, so the time of a look that was set before stays.
         """
         if self._pool.polling or self._pool.is_spin_once:
-            self.arm_by(self._agenda.first())
+            self.arm_by(self._agenda.next)
         elif self._pool.running and self._pool.engine.is_busy:
             self.arm_by(self._next_look(now))
 
     def rest(self, now: int) -> None:
         """Set the time for a thread that has nothing to run."""
-        if self._interpreter.holders or not self._pool.polling or not self._pool.running:
+        if self._holders or not self._pool.polling or not self._pool.running:
             self.arm(now)
             return
         if self.check.entry:
             self.check.note(now)  # what was to be checked has ended
-        first = self._agenda.first()
+        first = self._agenda.next
         if first != self._timer.at:
             self._timer.arm(first)
         # a parked thread would look, although one waits
@@ -254,7 +251,7 @@ class DueTimes:
             self._watch.arm(at)
 
     def _next_look(self, now: int) -> int:
-        return min(self._agenda.first_latest(), now + self._allowance)
+        return min(self._agenda.latest, now + self._allowance)
 
     def arm_late_look(self, now: int, patience: int) -> None:
         """
@@ -262,13 +259,12 @@ class DueTimes:
 
         :param patience: how long what waits, or may come, may wait for it.
         """
-        watch, at = self._watch, now + patience
-        if now + SHORT_CALLBACK_NS <= watch.at <= at and watch.at <= self._agenda.latest:
-            return  # as nearly always; the rest is the same, but ``latest`` may be too early
+        at = now + patience
         if self._agenda.latest < at:
-            at = min(self._agenda.first_latest(), at)
-        if at < watch.at or watch.at < now + SHORT_CALLBACK_NS:  # else it is good enough
-            watch.arm(at)
+            at = self._agenda.latest
+        is_set_to = self._watch.at
+        if at < is_set_to or is_set_to < now + SHORT_CALLBACK_NS:  # else it is good enough
+            self._watch.arm(at)
 
     def has_looked(self, now: int) -> None:
         """Note that the time of a look has come."""

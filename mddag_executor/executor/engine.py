@@ -103,19 +103,20 @@ class Step:
     :ivar work: the execution to run; None: there is none.
     :ivar is_short: whether it usually ends soon; this and what follows only if there is one:
     :ivar patience_ns: how long what waits, or may come, may wait for a short execution to end.
+    :ivar n_idle: how many workers run nothing.
     :ivar overtaken: the executions that are to pause; this and what follows always:
     :ivar more: whether another thread may start an execution now.
-    :ivar n_idle: how many workers run nothing.
     """
 
     __slots__ = ('work', 'is_short', 'overtaken', 'more', 'n_idle', 'patience_ns')
 
-    def __init__(self) -> None:
+    def __init__(self, is_short: bool = False, n_idle: int = 0) -> None:
         self.work: Work | None = None
-        self.overtaken: Sequence[Work] = ()
-        self.is_short = self.more = False
-        self.n_idle = 0
+        self.is_short = is_short
         self.patience_ns = NET_NS
+        self.n_idle = n_idle
+        self.overtaken: Sequence[Work] = ()
+        self.more = False
 
 
 class Engine:
@@ -162,7 +163,7 @@ class Engine:
         self._records = None if record is None else RunRecords(
             record, self.tables, self.scheduler.state)
         self.on_late = on_late
-        self.undeclared = 0
+        self._undeclared = 0
         #: The last steps of the system clock: when, and by how much it was set forward.
         self.clock_steps: deque[tuple[int, int]] = deque(maxlen=KEEP_STEPS)
         # entities whose executions a callback group has refused
@@ -182,7 +183,8 @@ class Engine:
         self._ended = NEVER
         self.interpreter = Interpreter(self.tables, self._state)
         self._holders = self.interpreter.holders
-        self._step = Step()
+        self._step, self._nothing = Step(), Step()
+        self._past_core = Step(is_short=True, n_idle=n_workers - 1)
         urgency = self.scheduler.policy.urgency
         self._keys_are_times = urgency != OTHER_KEYS
         # whether the ends of most executions only matter to the core
@@ -302,17 +304,18 @@ class Engine:
                 entity.ready += 1
                 self.verdicts.dropped(entity, NO_ORIGIN, 'destroyed', now)
             return
-        self.undeclared += not entity.may_answer
         work.ready_ns = now
-        waiting = entity.waiting
-        bypass = self._bypass
-        if entity.may_answer or 0 < entity.depth <= len(waiting) or (
-                entity.outer >= 0 and not self.outer.is_open(entity.outer)):
+        waiting, bypass = entity.waiting, self._bypass
+        if entity.may_answer:
             self._end_bypass()
-        elif bypass.is_open or self._may_bypass and self._is_core_empty():
-            bypass.is_open = True
-            bypass.enter(work)
-            return
+        else:
+            if waiting and 0 < entity.depth <= len(waiting) or (
+                    entity.outer >= 0 and not self.outer.is_open(entity.outer)):
+                self._end_bypass()
+            elif bypass.is_open or self._opens_bypass():
+                bypass.enter(work)
+                return
+            self._undeclared += 1
         self._enqueue(work)
         entity.ready += 1
         if 0 < entity.depth < len(waiting):
@@ -362,6 +365,12 @@ class Engine:
         self._may_bypass = policy.key(
             self.tables, undeclared, 0, 1, 0) < policy.key(self.tables, undeclared, 0, 0, 1)
 
+    def _opens_bypass(self) -> bool:
+        """Open the bypass if undeclared executions may use it now; return whether they may."""
+        bypass = self._bypass
+        bypass.is_open = self._may_bypass and self._is_core_empty()
+        return bypass.is_open
+
     def _is_core_empty(self) -> bool:
         """Return whether nothing is waiting, running on a worker or owning a group in the core."""
         state = self._state
@@ -379,11 +388,16 @@ class Engine:
                 self._enqueue(work)
         return self.scheduler
 
+    @property
+    def undeclared(self) -> int:
+        """Return the number of executions of no job that have become ready."""
+        return self._undeclared + self._bypass.n_entered
+
     def ran_at_once(self, entity: Entity) -> None:
         """Count an undeclared callback that was handled at once."""
         entity.ready += 1
         entity.ran += 1
-        self.undeclared += 1
+        self._undeclared += 1
 
     def _start_job(self, work: Work, release: int, now: int) -> None:
         dag = self.tables.dag_of[work.entity.source]
@@ -527,15 +541,27 @@ class Engine:
         :param worker: the worker to use if it is idle; else the lowest idle one is used.
         :param others_wait: whether a thread waits for events, which can start more at once.
         """
-        step, bypass = self._step, self._bypass
+        bypass = self._bypass
+        if bypass.queue:
+            work = bypass.start(worker, now)
+            if work is not None:
+                if work.entity.collect_more is not None:
+                    self._collect_more(work.entity)
+                step = self._past_core
+                step.work = work
+                if bypass.queue:
+                    step.patience_ns = self.interpreter.patience()
+                    step.more = others_wait and self._may_start_more(now)
+                else:
+                    step.patience_ns = NET_NS
+                    step.more = False
+                return step
+        elif not (self._ready or self._deferred):  # nearly every second time
+            return self._nothing
+        step = self._step
         step.overtaken = ()
-        if not (self._ready or self._deferred or bypass.queue):  # nearly every second time
-            step.work = None
-            step.more = False
-            step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
-            return step
         work = step.work = self._dispatch(worker, now)
-        step.n_idle = self._scalars[N_IDLE] - (bypass.running is not None)
+        step.n_idle = self._scalars[N_IDLE]  # nothing runs past the core any more
         is_short = False
         if work is not None:
             is_short = step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
@@ -556,13 +582,8 @@ class Engine:
         step = self._step
         step.work = None
         step.overtaken = ()
-        step.n_idle = self.idle_workers
         step.more = self.has_waiting and self._may_start_more(now)
         return step
-
-    def next_deadline(self) -> int:
-        """Return a time at or before the next deadline of an open job, on the trace's clock."""
-        return NEVER if self.deadlines.next == NEVER else self.deadlines.first()
 
     def patience(self) -> int:
         """
@@ -579,11 +600,6 @@ class Engine:
 
     def _dispatch(self, worker: int, now: int) -> Work | None:
         if self._bypass.is_open:
-            past_core = self._bypass.start(worker, now)
-            if past_core is not None:
-                if past_core.entity.collect_more is not None:
-                    self._collect_more(past_core.entity)
-                return past_core
             self._end_bypass()
         state = self._state
         if state.worker_x[worker] >= 0:

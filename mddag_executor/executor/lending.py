@@ -42,7 +42,7 @@ class Pool(Protocol):
     running: bool
     offset: int
     now: int
-    n_ended: int
+    last_end: int
 
     @property
     def executor(self) -> Spinner | None:
@@ -154,7 +154,7 @@ class Lending:
         seen = -1, False
         while not me.permit.acquire(timeout=REJOIN_NS / 1e9):
             with pool.lock:
-                before, seen = seen, (pool.n_ended, self._all_wait(checks))
+                before, seen = seen, (pool.last_end, self._all_wait(checks))
                 if work in self.rejoining and engine.waits_for_place(work) and (
                         pool.now - now < ALONE_NS):
                     pool.tick()     # it is not to overlap with the one that has its place

@@ -22,8 +22,9 @@ keeps it for a switch interval.
 from __future__ import annotations
 
 from array import array
+from collections.abc import Callable
 import ctypes
-from functools import cache
+from functools import cache, partial
 import os
 import platform
 import threading
@@ -77,6 +78,8 @@ _until_next_call.restype = ctypes.c_int
 
 # without errno and conversions of arguments: half the time, for each timer that is due
 _timer_settime = _quick.timerfd_settime
+_no_time = array('q', (0, 0, 0, 0))
+_NO_TIME = ctypes.c_void_p(_no_time.buffer_info()[0])
 
 
 class ListenerError(MddagError):
@@ -209,6 +212,10 @@ class NextCall:
         return self._value.value
 
 
+def _nothing() -> int:
+    return 0
+
+
 class TimerFd:
     """
     A timerfd on the monotonic clock.
@@ -217,7 +224,7 @@ class TimerFd:
     :ivar at: that time, monotonic ns; NEVER: none is set.
     """
 
-    __slots__ = ('fd', 'at', '_time', '_address')
+    __slots__ = ('fd', 'at', '_time', '_set', '_unset')
 
     def __init__(self) -> None:
         self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
@@ -226,7 +233,11 @@ class TimerFd:
             raise OSError(error, os.strerror(error))
         self.at = NEVER
         self._time = array('q', (0, 0, 0, 0))  # interval, then time: seconds, nanoseconds
-        self._address = ctypes.c_void_p(self._time.buffer_info()[0])
+        # 1: TFD_TIMER_ABSTIME
+        address = ctypes.c_void_p(self._time.buffer_info()[0])
+        self._set: Callable[[], int] = partial(_timer_settime, self.fd, 1, address, None)
+        self._unset: Callable[[], int] = partial(
+            _timer_settime, self.fd, 1, _NO_TIME, None)
 
     def arm(self, at: int) -> None:
         """
@@ -235,17 +246,22 @@ class TimerFd:
         A time in the past, also one before the boot of the machine, expires at once.
         """
         self.at = at
-        # the system call knows no negative times, and 0 stands for none
+        if at >= NEVER:
+            self._unset()
+            return
+        if at <= 0:  # the system call knows no negative times, and 0 stands for none
+            at = 1
         fields = self._time
-        fields[2], fields[3] = divmod(at if at > 0 else 1, 1_000_000_000) if at < NEVER else (0, 0)
-        # 1: TFD_TIMER_ABSTIME
-        if _timer_settime(self.fd, 1, self._address, None) != 0 and self.fd >= 0:
+        fields[2] = at // 1_000_000_000
+        fields[3] = at % 1_000_000_000
+        if self._set() != 0 and self.fd >= 0:
             raise OSError(f'timerfd_settime does not accept {self._time[2:].tolist()}')
 
     def close(self) -> None:
         """Close the descriptor, once."""
         fd, self.fd = self.fd, -1
         if fd >= 0:
+            self._set = self._unset = _nothing  # another descriptor may get its number
             os.close(fd)
 
     def __del__(self) -> None:

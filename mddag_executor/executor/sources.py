@@ -67,9 +67,10 @@ class ArrivalEntity(ListenerEntity):
                     return  # another thread has collected it
             if self.removed:
                 return  # another executor may have it now
+            most = self.most_waiting
             misses = (left if left < MANY else _MOST_FOREIGN) if self.hears_others else 1
             for _ in range(left if left < MOST else MOST):
-                if 0 < self.most_waiting <= len(self.waiting):
+                if most and most <= len(self.waiting):
                     self.collect_more = partial(self.collect, MANY)
                     return
                 left -= 1

@@ -104,7 +104,6 @@ class WorkerThread:
     :ivar is_out: whether its callback has no worker now.
     :ivar waits: whether it still waits for the answer for which it lent its worker.
     :ivar waits_for: what it waits for then; empty: it does not wait, or that is unknown.
-    :ivar since: when the running execution began, on the trace's clock; 0: none runs.
     :ivar measurement: of its running callback; None: it is not measured.
     :ivar paused_ns: for how long the running callback has paused.
     :ivar pause: the pause of the callback that it has just overtaken.
@@ -112,8 +111,8 @@ class WorkerThread:
     :ivar is_copy: whether its callback has forked this process, which is the child.
     :ivar is_spare: whether its last callback has left the events to another thread.
     :ivar published: when the running callback first published (monotonic ns); 0: not yet.
-    :ivar start: when the execution that has just ended began; ``end``: when it ended (on the
-        trace's clock).
+    :ivar start: when its execution, or the one that has just ended, began, on the trace's clock.
+    :ivar end: when it ended; 0: it runs.
     :ivar outcome: its exception, or the future that it waits for, if it goes on later; None: it
         has finished.
     """
@@ -121,7 +120,7 @@ class WorkerThread:
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
                  'state', 'is_spare', 'has_lent', 'pool', 'engine', 'start', 'end', 'outcome',
                  'waits_since', 'waits_for', 'is_out', 'measurement', 'pause', 'paused_ns',
-                 'name', 'since', 'is_copy')
+                 'name', 'is_copy')
 
     def __init__(self, pool: Pool, thread: threading.Thread | None) -> None:
         self.pool = pool
@@ -139,12 +138,16 @@ class WorkerThread:
         self.is_spare = self.is_copy = False
         self.state = ThreadState.RUNNING if thread is None else ThreadState.PARKED
         self.published = self.start = self.end = self.waits_since = self.paused_ns = 0
-        self.since = 0
         self.outcome: Any = None
 
     def begin(self) -> None:
         """Note the ids of the calling thread."""
         self.vtid, self.ident = threading.get_native_id(), threading.get_ident()
+
+    @property
+    def since(self) -> int:
+        """Return when the running execution began, on the trace's clock; 0: none runs."""
+        return 0 if self.end else self.start
 
     def is_short(self) -> bool:
         """Return whether the thread runs a short callback that has its worker."""
@@ -203,13 +206,12 @@ class WorkerThread:
             entity.may_be_gone and work.ready_ns != pool.now)  # else it was just checked
         measurement = None
         if habit.rests < 1 or pool.is_recorded:
-            measurement = Measurement(habit)
-        self.measurement = measurement
+            measurement = self.measurement = Measurement(habit)
         self.published = self.paused_ns = 0
         if self.pause is not None:
             self.wait_for_pause()
-        start = monotonic_ns()
-        self.since = start + pool.offset
+        start = self.start = monotonic_ns() + pool.offset
+        self.end = 0
         try:
             if group is not None and work.coroutine is None and (
                     not group.beginning_execution(entity.rclpy_object)):
@@ -217,7 +219,7 @@ class WorkerThread:
             self.outcome = (
                 work.run(must_check) if gate is None else gate(work, must_check))
         except Refused as error:
-            self.outcome, self.since = error, 0
+            self.outcome, self.end = error, start
             return
         except BaseException as error:
             self.outcome = from_user_code(error)
@@ -226,13 +228,13 @@ class WorkerThread:
         if group is not None and (
                 self.outcome is None or isinstance(self.outcome, BaseException)):
             group.ending_execution(entity.rclpy_object)
-        end = monotonic_ns()
-        self.start, self.end, self.since = self.since, end + pool.offset, 0
+        end = self.end = monotonic_ns() + pool.offset
         wall = end - start - self.paused_ns
         if measurement is None and wall <= SHORT_CALLBACK_NS >= entity.wall_ns:
             habit.rests -= 1  # an average of short executions stays short without a measurement
             if self.published:
-                entity.tail_ns += (end - self.published - entity.tail_ns) >> 3
+                tail = end - pool.offset - self.published
+                entity.tail_ns += (tail - entity.tail_ns) >> 3
         else:
             self._note_times(work, measurement, wall)
         if pool.callback_ended is not None and not isinstance(self.outcome, BaseException):
@@ -246,6 +248,7 @@ class WorkerThread:
             habit.rests -= 1
         else:
             work.cpu_ns += measurement.end()
+            self.measurement = None
         if wall > SHORT_CALLBACK_NS:
             if (measurement is None or not measurement.is_complete) and not self.has_lent:
                 habit.waited(wall)

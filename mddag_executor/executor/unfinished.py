@@ -36,9 +36,12 @@ class Thread(Protocol):
     work: Work | None
     vtid: int
     ident: int
-    since: int
     is_out: bool
     waits_for: str
+
+    @property
+    def since(self) -> int:
+        """Return when the running execution began, on the trace's clock; 0: none runs."""
 
 
 class Engine(Protocol):

@@ -44,6 +44,7 @@ from typing import Any, TYPE_CHECKING
 import weakref
 
 from mddag_executor.clocks import TraceClock
+from mddag_executor.core import NEVER
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
@@ -125,11 +126,14 @@ class WorkerPool:
         self.pauses = Pauses(self)
         self._paused = self.pauses.paused
         engine.interpreter.pauses = can_pause()
+        self._next_step = engine.step
+        self._deadlines = engine.deadlines
         self._interpreter = engine.interpreter
         self._holders = engine.interpreter.holders
         self.lending = Lending(self)
         self._rejoining = self.lending.rejoining
-        self.n_ended = 0
+        #: when the last execution ended, on the trace's clock
+        self.last_end = 0
         #: called after each callback: see ``MultiDeadlineExecutor.on_callback_ended``
         self.callback_ended: Callable[[Any, BaseException | None, int], bool] | None = None
         #: by number: see ``MultiDeadlineExecutor.new_outer_group``
@@ -170,6 +174,7 @@ class WorkerPool:
         self._loops: Loops | None = None
         self.now = 0
         self.due = DueTimes(self)
+        self._overdue = self.due.overdue
         #: counts messages that no declared callback has published; None: nothing is declared
         self.outside: Outside | None = None
 
@@ -274,7 +279,7 @@ class WorkerPool:
         """Wake a thread if it may start an execution, or check what that has to wait for."""
         if step.more:
             self.call()
-        elif step.n_idle:
+        elif self.engine.idle_workers:
             self.due.check.begin_if_wanted(now - self.offset)
 
     def call(self) -> None:
@@ -523,41 +528,40 @@ class WorkerPool:
         with self.lock:
             # inlined tick: saves a call for each execution
             now = self.now = monotonic_ns() + self.offset
-            since = now
-            if me.state is _WAITING:
-                since = me.waits_since
-                self._polled_at = now
             if events is None:
                 self._has_called = False
                 self.due.has_looked(now - self.offset)
                 self._look()
             else:
                 self._bell_rings = False  # the waiting thread may have received it
-                self._collect(events, since)
-            is_ready = me.work is None and not self.unlocked_calls
-            found = is_ready and self._choose(me, self.now)
+                self._polled_at = now
+                self._collect(events, me)
+            found = None
+            if me.work is None and not self.unlocked_calls:
+                found = self._choose(me, self.now)
         if self.unlocked_calls:
             self._make_unlocked_calls()
-        if not is_ready:
+        if found is None:
             found = me.work is None and self._go_on(me)
         return found
 
-    def _collect(self, events: Events, since: int) -> None:
+    def _collect(self, events: Events, me: WorkerThread | None) -> None:
         """
         Collect the arrivals of events, and handle what is due; the caller holds the lock.
 
-        :param since: since when the calling thread has waited for them.
+        :param me: the calling thread, if it has waited for them.
         """
-        running = self.running
+        if not self.running:
+            for source in self.loop.sources(events):
+                self.loop.announce(source)  # for the next spin
+            return
         for fd, _ in events:
             for source in self._channels.get(fd, ()):
-                if running:
-                    source.collect()
-                else:
-                    self.loop.announce(source)  # for the next spin
+                source.collect()
         # a recorded message is later than the turn began
-        if running and self.due.is_due(self.now - self.offset):
-            self.due.handle(self.now, since)
+        if self.due.is_due(self.now - self.offset):
+            self.due.handle(
+                self.now, self.now if me is None or me.state is not _WAITING else me.waits_since)
 
     def _look(self) -> None:
         """Collect what has come while no thread waited for it; the caller holds the lock."""
@@ -567,7 +571,7 @@ class WorkerPool:
             events = self.loop.poll()
             self._bell_rings = False
             now = self._polled_at = self.tick()
-            self._collect(events, now)
+            self._collect(events, None)
             if self.engine.interpreter.is_wanted():
                 self.due.check.begin_late(now - self.offset)
 
@@ -584,7 +588,7 @@ class WorkerPool:
             work: Any = me.work
             if work is not None:
                 me.work = None
-                self.n_ended += 1
+                self.last_end = now
                 if me.outcome is None and not me.has_lent:
                     engine.finished(work, me.start, me.end, now, me.vtid, work.worker)
                 else:
@@ -596,10 +600,12 @@ class WorkerPool:
                 if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:
                     self._look()
             if is_last:
+                found = False
                 self.due.arm(now - self.offset)
                 if self._verdicts.missed != self._misses:
                     self._note_misses()
-            found = not is_last and self._choose(me, self.now)
+            else:
+                found = self._choose(me, self.now)
             if self._paused:
                 self.pauses.end()
         if self.unlocked_calls:
@@ -647,7 +653,7 @@ class WorkerPool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
         if self.running and (not self.is_spin_once or me.thread is None):
-            step = self.engine.step(me.worker, now, self.polling > 0)
+            step = self._next_step(me.worker, now, self.polling > (me.state is _WAITING))
             if self._rejoining:
                 step = self._hand_over(me, step, now)
         else:
@@ -656,9 +662,10 @@ class WorkerPool:
         if step.overtaken:
             self.pauses.begin(step.overtaken, None if work is None else me)
         if work is None:
-            self._rest(me, step, now)
+            self._rest(me, step.more, now)
             return False
         me.work = work
+        step.work = None  # else it would keep the message
         me.worker = work.worker
         if me.state is not _RUNNING:
             self.become(me, _RUNNING)
@@ -674,13 +681,13 @@ class WorkerPool:
         """Let executions go on that were dispatched again; return the step after these."""
         while step.work in self._rejoining:
             self.lending.hand_over(step)
-            step = self.engine.step(me.worker, now, self.polling > 0)
+            step = self._next_step(me.worker, now, self.polling > (me.state is _WAITING))
         return step
 
     def _share_events(self, me: WorkerThread, step: Step, now: int) -> None:
         """Let another thread wait for events, or look for them, while one runs an execution."""
         due = self.due
-        me.is_spare = not (step.is_short or self._interpreter.holder is step.work)
+        me.is_spare = not (step.is_short or self._interpreter.holder is me.work)
         if self.polling or not step.is_short:  # else there is time until it ends
             due.overdue.update()
         if self.is_spin_once:
@@ -696,19 +703,26 @@ class WorkerPool:
             else:
                 due.arm_look(now - self.offset)
 
-    def _rest(self, me: WorkerThread, step: Step, now: int) -> None:
-        """Let a thread without an execution wait for events, or park it."""
-        self.due.overdue.update()
+    def _rest(self, me: WorkerThread, more: bool, now: int) -> None:
+        """
+        Let a thread without an execution wait for events, or park it.
+
+        :param more: whether another thread may start an execution now.
+        """
+        if self._deadlines.next < NEVER or self._overdue.deadline < NEVER:
+            self._overdue.update()
         if self._verdicts.missed != self._misses:
             self._note_misses()
         if me.thread is not None:  # else a visitor: the thread of a spin_once
             others = self.polling - (me.state is _WAITING)
+            state = _PARKED
             # while a callback computes, its thread handles the events when it ends
-            waits = self.running and not self.is_spin_once and not self._closed and (
-                self._eager > 0 or not self._holders) and (
-                others == 0 or me.is_spare and others < step.n_idle)
-            self.become(me, _WAITING if waits else _PARKED)
-            if step.more and self.is_spin_once:
+            if self.running and not self.is_spin_once and not self._closed and (
+                    not self._holders or self._eager) and (
+                    not others or me.is_spare and others < self.engine.idle_workers):
+                state = _WAITING
+            self.become(me, state)
+            if more and self.is_spin_once:
                 self.call()
         self.due.rest(now - self.offset)
 

@@ -489,16 +489,16 @@ def test_a_step_says_what_is_overtaken_and_when_the_next_deadline_is():
     engine.ready(Work(long, print), 0)
     step = engine.step(0, 0)
     held = step.work
-    assert not step.overtaken and engine.next_deadline() == NEVER
+    assert not step.overtaken and engine.deadlines.first() == NEVER
     engine.timer_due(Work(urgent, print), MS, MS)
     step = engine.step(1, MS)
     work = step.work
     assert work.entity is urgent and step.overtaken == [held]
-    assert engine.next_deadline() == 11 * MS and engine.interpreter.overtaken == [held]
+    assert engine.deadlines.first() == 11 * MS and engine.interpreter.overtaken == [held]
     engine.finished(work, MS, 2 * MS, 2 * MS, 0, 1)
     step = engine.step(1, 2 * MS)
     assert step.work is None and engine.interpreter.holders == [held]
-    assert engine.next_deadline() == NEVER
+    assert engine.deadlines.first() == NEVER
 
 
 @pytest.mark.parametrize('is_late', [False, True])

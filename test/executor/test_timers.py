@@ -38,7 +38,7 @@ MS = 1_000_000
 def waits_for_no_timer(executor):
     """Tell whether the executor knows of all timers, and none is to become due."""
     with pool_of(executor).lock:
-        return pool_of(executor).is_current and pool_of(executor).agenda.first() == NEVER
+        return pool_of(executor).is_current and pool_of(executor).agenda.next == NEVER
 
 
 class Appointed:
@@ -66,13 +66,36 @@ def test_each_appointment_comes_due_once_in_order_and_what_was_changed_leaves_no
             expected.pop(one, None)
         else:
             now += time_
-            while agenda.handle_next(now, agenda.last):
-                at = expected.pop(come[-1])[0]
+            come.clear()
+            agenda.handle(lambda now=now: now)
+            for each in come:
+                at = expected.pop(each)[0]
                 assert at <= now and at <= min((each[0] for each in expected.values()), default=at)
-        assert agenda.first() == min((each[0] for each in expected.values()), default=NEVER)
-        assert agenda.first_latest() == min((each[1] for each in expected.values()), default=NEVER)
+        assert agenda.next == min((each[0] for each in expected.values()), default=NEVER)
+        assert agenda.latest == min((each[1] for each in expected.values()), default=NEVER)
         assert len(agenda) <= 2 * len(expected) + 8
-    assert not agenda.handle_next(NEVER, 0)
+
+
+def test_what_is_set_while_appointments_come_due_is_not_due_yet():
+    agenda, come = Agenda(), []
+    first, second = Appointed(come), Appointed(come)
+    first.come_due = lambda: (come.append(first), agenda.set(second, 0, 0))
+    agenda.set(first, 1, 1)
+    agenda.handle(lambda: 2)
+    assert come == [first] and agenda.next == 0
+    agenda.handle(lambda: 2)
+    assert come == [first, second] and agenda.next == NEVER
+
+
+def test_an_appointment_that_fails_leaves_the_times_of_the_others():
+    agenda, come = Agenda(), []
+    failing, other = Appointed(come), Appointed(come)
+    failing.come_due = lambda: 1 // 0
+    agenda.set(failing, 1, 1)
+    agenda.set(other, 5, 6)
+    with pytest.raises(ZeroDivisionError):
+        agenda.handle(lambda: 2)
+    assert (agenda.next, agenda.latest) == (5, 6)
 
 
 def test_the_deadline_of_a_job_that_was_in_time_wakes_no_thread(make_executor, make_node):
@@ -219,11 +242,11 @@ def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
     place = executor._at_once if sleeps else pool_of(executor)
     (source,) = place.timers._timers.values()
     arrived = list(place.loop.sources(place.loop.wait(0)))
-    assert source in arrived and place.agenda.first() < NEVER
+    assert source in arrived and place.agenda.next < NEVER
     other.add_node(node)
     for each in arrived:
         each.collect()
-    assert place.agenda.first() == NEVER
+    assert place.agenda.next == NEVER
     del kept
 
 
@@ -321,10 +344,19 @@ def test_any_time_can_be_set_and_never_is_none():
     finally:
         timer.close()
     timer.arm(1)  # as an executor that has ended may do
-    timer.fd = os.open(os.devnull, os.O_RDONLY)
-    with pytest.raises(OSError, match='timerfd_settime'):
-        timer.arm(1)
-    timer.close()
+    timer.arm(NEVER)
+
+
+def test_a_time_that_the_kernel_does_not_accept_is_an_error():
+    timer = TimerFd()
+    file = os.open(os.devnull, os.O_RDONLY)
+    try:
+        os.dup2(file, timer.fd)
+        with pytest.raises(OSError, match='timerfd_settime'):
+            timer.arm(1)
+    finally:
+        os.close(file)
+        timer.close()
 
 
 # --- what is due or arrives before it is noticed -------------------------------------------------
@@ -454,16 +486,14 @@ def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_n
         assert wait_for(lambda: executor.statistics()['callbacks']['/node:on_clock']['ran'] == 1)
 
 
-def test_the_spinning_thread_changes_its_agenda_under_the_lock_only(make_executor):
+def test_the_spinning_thread_changes_its_agenda_under_the_lock_only(make_executor, monkeypatch):
     """Another thread may set a timer just then, which must not be lost."""
-    executor = make_executor()
-    agenda, timer = at_once_of(executor).agenda, SimpleNamespace(entry=None)
-    at = time.monotonic_ns() + 10 ** 12
-    with pool_of(executor).lock:
-        agenda.set(timer, at, at)
-        agenda.cancel(timer)
-    at_once_of(executor).handle([])
-    assert len(agenda._heap) == 1
+    at_once, is_inside = at_once_of(make_executor()), []
+    monkeypatch.setattr(at_once.agenda, 'handle', lambda clock: is_inside.append(
+        at_once.pool.is_inside()))
+    at_once.loop.timer.arm(1)
+    at_once.handle([])
+    assert is_inside == [True] and not at_once.pool.is_inside()
 
 
 def test_a_step_of_the_system_clock_is_noticed(make_executor, make_node, tmp_path, monkeypatch):
