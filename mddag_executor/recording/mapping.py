@@ -172,7 +172,7 @@ def report_missing(
                  'give the graph of the nodes that were recorded, or none'))
     return [Loss('callbacks', len(absent), (
         f'{name}: not in it: {len(absent)} of the {len(judge.callbacks)} callbacks of '
-        f'{judge.file}, so results that need them are missed or never due: '
+        f'{judge.file}, so results that need them are missed, not judged or never due: '
         + listed([key if each is None else f'{key} ({each})'
                   for key, each in questions.items()])))]
 

@@ -269,5 +269,5 @@ def _fill(
             if field in names:
                 value = events[field]
                 np.copyto(found[name], value, casting='unsafe', where=value != 0)
-    if kind[0] == START and 'cpu_time' in names:
+    if kind[0] == START and {'cpu_time', 'held_interpreter'} <= {*names}:
         found['d'] = 2 * (events['cpu_time'] + 1) + (events['held_interpreter'] != 0)

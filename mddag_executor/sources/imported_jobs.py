@@ -20,6 +20,8 @@ Events are named by their position in the order of time.
      or its start or end is not recorded.  If the message's source timestamp is known but its
      publication is not, this only affects jobs without a recorded publication with source
      timestamp to this callback;
+   * a callback whose initialisation is not recorded ran, which may be one of its uncompleted
+     vertices, since their callback is not in the recording;
    * events are missing in a gap that had not ended at its release, and had begun when it
      expired.
 
@@ -37,7 +39,7 @@ Events are named by their position in the order of time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import NamedTuple
 
 from mddag_executor.core import EXPIRE_AFTER_NS, legs_of, Tables
@@ -61,8 +63,8 @@ import numpy as np
 
 _NEVER = 2 ** 62
 """A position after all events."""
-_ANY = -2
-"""Instead of a vertex: any of them."""
+_ANY, _NOT_FOUND = -2, -3
+"""Instead of a vertex: any of them; any of those whose callbacks are not in the recording."""
 SKIPPED = np.dtype([('after', 'i8'), ('release', 'i8'), ('noticed', 'i8')])
 """
 Columns of a skipped release: the row of the release before it, when it was due, and when it was
@@ -339,7 +341,8 @@ class ImportedJobs:
         """
         open_ones, withdrawn = np.zeros((2, len(closed)), dtype=np.bool_)
         doubts = _Doubts(
-            self._links, self._declared, self._row, self._unknown, self._distrusted)
+            self._links, self._declared, self._row, self._unknown, self._distrusted,
+            set(self._vertices.values()) - set(self._declared.tolist()))
         dags, release, job = (self.releases[name] for name in ('dag', 'release', 'job'))
         until = position[closed]
         row, at = self._row[done], self._links.runs['end_at'][done]
@@ -370,11 +373,18 @@ class _Doubts:
     :param row: by run of a callback the row of its job.
     :param unknown: executions for an unknown job.
     :param distrusted: by run of a callback whether the clock of its sender is unknown.
+    :param not_found: the vertices whose callbacks are not in the recording.
     """
 
     def __init__(
-        self, links: Links, declared: Ints, row: Ints, unknown: Ints, distrusted: Mask
+        self, links: Links, declared: Ints, row: Ints, unknown: Ints, distrusted: Mask,
+        not_found: Set[int],
     ) -> None:
+        self._not_found = not_found
+        nameless = np.array([each.kind == 'unknown' or (each.kind != 'other' and each.node is None)
+                             for each in links.callbacks], dtype=np.bool_)
+        declared = np.where(nameless, _NOT_FOUND, declared)
+        unknown = np.append(unknown, np.flatnonzero(nameless[links.runs['callback']]))
         runs, messages = links.runs[unknown], links.messages
         at, callback, _, time = links.lost.T
         self._of = np.append(np.append(declared, _ANY)[callback], declared[runs['callback']])
@@ -382,7 +392,8 @@ class _Doubts:
         distrusted = distrusted[unknown]
         self._unsent = np.append(
             np.zeros(len(at), np.bool_),
-            ((runs['message'] >= 0) | (runs['stamp'] != 0)) & ~distrusted)
+            ((runs['message'] >= 0) | (runs['stamp'] != 0)) & ~distrusted & ~nameless[
+                runs['callback']])
         # by an unknown clock, the callback may have run in any job
         self._at = np.append(at, np.where(distrusted, -1, runs['at']))
         self._time = np.append(time, np.where(distrusted, _NEVER, runs['start']))
@@ -406,6 +417,8 @@ class _Doubts:
         for vertex, key in zip(dag.vertices, keys):
             still = undone[:, vertex.index]
             doubted |= still & (self._latest(key, False, until) >= release)
+            if key in self._not_found:
+                doubted |= still & (self._latest(_NOT_FOUND, False, until) >= release)
             still = still & (self._latest(key, True, until) >= release)
             for topic in vertex.callback.topics if still.any() else ():
                 number = np.full(len(jobs), self._topics.get(topic, UNKNOWN))

@@ -33,7 +33,7 @@ before another one in the same thread.
    and index of the ring buffer (`rclcpp_ring_buffer_enqueue`, `_dequeue`).
 5. `rmw_take` inside an execution: the callback itself took the message (a queue edge).
 6. Events that don't match (ends without starts, starts without ends, messages without publication,
-   publishers without tracepoint) are counted by callback or topic.
+   publishers without tracepoint or initialisation) are counted by callback, topic or process.
 """
 
 from __future__ import annotations
@@ -92,7 +92,9 @@ _SAID = {
     'partial': ('publication', 'without the tracepoint rclcpp_publish that others of the '
                 'publisher have: counted from rcl_publish on'),
     'overwritten': ('message', 'overwritten in a ring buffer, never taken'),
-    'unknown': ('execution', 'of a callback whose initialisation is not in it')}
+    'unknown': ('execution', 'of a callback whose initialisation is not in it'),
+    'publishers': ('publication', 'of a publisher whose initialisation is not in it, so of no '
+                   'topic')}
 
 
 class Oddities:
@@ -196,6 +198,10 @@ class Links:
         self.runs = self._runs()
         self.messages = self._publications()
         self.topic_of = self._numbers([*names[1:], ''])[self.messages['publisher']]
+        nameless = self.messages['at'][self.messages['publisher'] < 0]
+        for pid, number in zip(*np.unique(
+                self._pid[self.events['thread'][nameless]], return_counts=True)):
+            self.losses.count('publishers', f'process {pid}', int(number))
         several = self._stamp_messages()
         #: Topics and source timestamps of publications; several possible ones are there twice.
         known = np.flatnonzero(self.messages['stamp'] != 0)

@@ -21,8 +21,9 @@ of executions is (``declared_events``).
    clock, so they are compared with recorded times before these are converted.
 3. *Twice.*  If LTTng has also recorded a process of this executor, its events are left out: those
    of the executor's trace say more.  It is the same process if the computers are not known to
-   differ, the process ids are equal, LTTng has no execution of it, and no other nodes.  Otherwise
-   the process of this executor gets another id, as containers have ids of their own.
+   differ, the process ids are equal, and a node is in both or, if LTTng has none of it, neither
+   an execution.  Otherwise the process of this executor gets another id, as containers have ids
+   of their own.
 4. *Begin and end.*  Recordings begin and end at different times.  Jobs are judged from the first
    one on that had an execution in each recording, after the first release that its executor
    judges.  After the recorded end of one of them its events are missing like those that a tracer
@@ -257,8 +258,8 @@ class MixedRun(UndeclaredRun):
             for pid in sorted(events.own):
                 boots = {each[pid].boot for each in (clocks, own) if pid in each} - {''}
                 mine = nodes.get(pid, set())
-                if pid not in threads or pid in runs or len(boots) > 1 or (
-                        mine and not mine & _nodes(events).get(pid, set())):
+                is_same = bool(mine & _nodes(events).get(pid, set())) if mine else pid not in runs
+                if pid not in threads or len(boots) > 1 or not is_same:
                     continue
                 out.add(pid)
                 self._duplicates.append(

@@ -223,7 +223,7 @@ def test_callbacks_that_the_trace_lacks(tmp_path):
     outcome = replay(path, loads(more, 'more.yaml'))
     assert outcome.warnings == [
         f'{path}: not in it: 1 of the 8 callbacks of more.yaml, so results that need them are '
-        'missed or never due: /radar:scan',
+        'missed, not judged or never due: /radar:scan',
         'more.yaml: 1 DAG without jobs, because the source is not a source in the recording: '
         '/radar']
     assert outcome.result()['dags']['/radar']['jobs'] == 0

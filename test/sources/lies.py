@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings whose values are changed at random."""
 
-from mddag_executor.trace import EventType, TraceFile
+from mddag_executor.trace import EventType, TraceFile, TraceReader
 
 TEXTS = ('', '/', '/camera', 'x' * 5000, '\x1b[2J\n', '/camera\n')
 NUMBERS = (0, 1, 2, -1, 11, 12, 100, 30_012, 2 ** 62, 2 ** 63 - 1, -2 ** 63)
@@ -42,11 +42,24 @@ def tell_lies(events, target, rng):
         elif fields:
             values[place] = lie(values[place], rng)
         events[at] = layout, time, pid, tid, *values
+    write_events(events, target)
+    return lies
+
+
+def events_of(path):
+    """Return the events of a trace, as ``write_events`` receives them."""
+    return [((layout.name, layout.fields), *event)
+            for layout, *event in TraceReader(path).layout_events(None)]
+
+
+def write_events(events, target, chunk=None):
+    """Write events, so many to a chunk; numbers are of 64 bits."""
     with TraceFile(target, overwrite=True) as file:
-        for (name, names), time, pid, tid, *values in events:
+        for place, ((name, names), time, pid, tid, *values) in enumerate(events, 1):
             provider, _, short = name.partition(':')
             key = file.define(EventType(provider, short, tuple(
                 (field, {str: 'string', bool: 'bool'}.get(type(value), 'int64'))
                 for field, value in zip(names, values))))
             file.extend(((key, time, tid, *values),), pid)
-    return lies
+            if chunk is not None and place % chunk == 0:
+                file.flush()

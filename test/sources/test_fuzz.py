@@ -35,7 +35,10 @@ from ..trace.helpers import records_of
 from .bags import write_bag
 from .helpers import MS, SMALL, small, VirtualRun, Written
 from .imported import GRAPH, record
-from .lies import tell_lies
+from .lies import events_of, tell_lies, write_events
+from .mixed import detector, robot
+from .mixed import GRAPH as MIXED
+from .of_processes import Trace
 from .recorded import Recorded
 
 LONG_S = float(os.environ.get('FUZZ_SECONDS', '0'))
@@ -134,35 +137,113 @@ def bounded_memory():
     assert (after - before) * 1024 < MEMORY
 
 
-def test_damaged_files(tmp_path):
-    """What is counted is right, or less is and that is said."""
-    path = tmp_path / 'a.mcap'
-    VirtualRun(path, small(), 2, duration=60 * MS, flush_every=20)      # several chunks
-    data, expected = path.read_bytes(), counts(replay(path).result())
-    replayed = 0
-    for seed in rounds(100):
-        rng, changed = random.Random(seed), bytearray(data)
-        mutate = rng.choice((flip, flip, cut, stretch, row))
+def sound(folder, kind):
+    """
+    Write the recordings of a run, each in several chunks.
+
+    :return: their paths, and the declaration to judge by, if none is in them.
+    """
+    graph = None
+    if kind == 'own':
+        VirtualRun(folder / 'a.mcap', small(), 2, duration=60 * MS, flush_every=20)
+        return [folder / 'a.mcap'], None
+    if kind == 'several':
+        up, down = Trace(folder, 'up', 0), Trace(folder, 'down', 1)
+        for job, took in enumerate((2, 2, 7, 3)):
+            up.runs(job * 10 * MS, job * 10 * MS + MS)
+            down.runs(job * 10 * MS + 5, (job * 10 + 3) * MS, took * MS)
+        written = [up.end(60 * MS), down.end(60 * MS)]
+    elif kind == 'imported':
+        graph = loads(GRAPH, 'graph.yaml')
+        written = [record(Recorded(folder / 'imported')).write()]
+    else:
+        graph = loads(MIXED, 'graph.yaml')
+        written = [detector(folder / 'detector', 4, declared=kind == 'mixed declared')]
+        if kind != 'undeclared':
+            written.append(robot(folder / 'robot', n=4, until=4).write())
+    paths = [folder / f'run.{place}.mcap' for place in range(len(written))]
+    for source, target in zip(written, paths):
+        write_events(events_of(source), target, chunk=12)
+    return paths, graph
+
+
+KINDS = ['own', 'several', 'imported', 'undeclared', 'mixed', 'mixed declared']
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_damaged_files(tmp_path, kind):
+    """All figures are those of the sound files, or a warning says that something is missing."""
+    paths, graph = sound(tmp_path, kind)
+    data = [path.read_bytes() for path in paths]
+
+    def read(_, judge=replay, **options):
+        return judge(paths if len(paths) > 1 else paths[0], graph, **options)
+
+    whole = read(None)
+    expected, figures, replayed = counts(whole.result()), plain(whole), 0
+    for seed in rounds(40):
+        rng = random.Random(seed)
+        place, mutate = rng.randrange(len(paths)), rng.choice((flip, flip, cut, stretch, row))
+        changed = bytearray(data[place])
         mutate(changed, rng)
-        path.write_bytes(changed)
-        outcome = attempt(path, replay, seed)
-        if outcome is None:
-            continue
-        replayed += 1
-        found = counts(outcome.result())
-        if found != expected:
-            assert outcome.warnings, seed
-            if mutate not in (row, stretch):    # which may double sound chunks
+        paths[place].write_bytes(changed)
+        outcome = attempt(paths[place], read, seed)
+        if outcome is not None:
+            replayed += 1
+            found = counts(outcome.result())
+            if plain(outcome) != figures:
+                assert {*outcome.warnings} - {*whole.warnings}, seed
+            if kind == 'own' and mutate not in (row, stretch):    # which may double sound chunks
                 assert {key: n for key, n in found.items() if n > expected[key]} == {}
-        if seed % 8 == 0:
-            attempt(path, lambda path: reschedule(path, workers=1).result(), seed)
-    assert replayed > 20
+            if seed % 8 == 0:
+                attempt(paths[place], lambda path: read(
+                    path, reschedule, policy='rad', workers=1).result(), seed)
+        paths[place].write_bytes(data[place])
+    assert replayed > 8
 
 
+def plain(outcome):
+    """Return all figures, without the warnings."""
+    return {key: value for key, value in outcome.result().items() if key != 'warnings'}
 
 
 def size(result):
     return sum(dag['jobs'] for dag in result['dags'].values())
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_any_event_may_lack_or_be_changed(tmp_path, kind):
+    """Every kind of recording with lies in it is read, or refused in one line."""
+    paths, graph = sound(tmp_path, kind)
+    events, replayed = [events_of(path) for path in paths], 0
+    for seed in rounds(15):
+        rng = random.Random(seed)
+        for path, mine in zip(paths, events):
+            tell_lies(mine, path, rng)
+        result = attempt(paths[0], lambda path: replay(
+            paths if len(paths) > 1 else path, graph).result(), seed)
+        if result is not None:
+            replayed += 1
+            for dag in result['dags'].values():
+                assert all(0 <= sink['completed'] <= dag['jobs'] for sink in dag['sinks'].values())
+    assert replayed > 5
+
+
+@pytest.mark.parametrize('kind', ['own', 'undeclared', 'mixed declared'])
+def test_each_field_of_each_event_may_be_missing(tmp_path, kind):
+    """As in recordings of other versions, or of damaged ones."""
+    paths, graph = sound(tmp_path, kind)
+    events, count = events_of(paths[0]), 0
+    for name, fields in sorted({layout for layout, *_ in events}):
+        for place, field in enumerate(fields, 3):
+            write_events([
+                ((name, tuple(each for each in fields if each != field)), *values[:place],
+                 *values[place + 1:]) if layout == (name, fields) else (layout, *values)
+                for layout, *values in events], paths[0])
+            result = attempt(paths[0], lambda path: replay(
+                paths if len(paths) > 1 else path, graph).result(), f'{name} without {field}')
+            count += result is not None
+    assert count > 20
 
 
 @pytest.mark.parametrize('kind', ['own', 'imported'])
@@ -174,8 +255,7 @@ def test_events_that_say_something_else(tmp_path, kind):
     else:
         record(Recorded(sound)).write()
         graph = loads(GRAPH, 'graph.yaml')
-    events = [((layout.name, layout.fields), *event)
-              for layout, *event in TraceReader(sound).layout_events(None)]
+    events = events_of(sound)
     whole = reschedule(sound, graph, policy='rad', workers=2)
     jobs, replayed = size(whole.result()), 0
     for seed in rounds(40):

@@ -166,6 +166,39 @@ def test_a_job_that_would_expire_while_events_are_discarded_is_not_judged(record
     assert camera['ends']['expired'] == 0
 
 
+@pytest.mark.parametrize(('lost', 'runs', 'ends'), [
+    ((), True, (N, 0, 0)), (('rcl_node_init',), True, (0, 0, N)), ((), False, (0, N, 0)),
+    (('_subscription_init', '_subscription_callback_added'), True, (0, 0, N))])
+def test_a_callback_without_initialisation_may_be_the_declared_one(tmp_path, lost, runs, ends):
+    """Its process was started before the tracer, and nothing says which callback it is."""
+    r = Recorded(tmp_path / 'camera.mcap')
+    r.node(2, '/detect', time=-MS, pid=2)
+    r.subscription(DETECT, 2, '/image', time=-MS, pid=2)
+    gone = [place for place, name in enumerate(r.names()) if name.endswith(lost or ('nothing',))]
+    r.node(1, '/camera')
+    r.timer(GRAB, 1, 100 * MS)
+    r.publisher(IMAGE, 1, '/image')
+    for k in range(1, N + 2):
+        at = k * 2000 * MS
+        r.run(GRAB, 1, at, at + MS)
+        stamp = r.publish(IMAGE, 1, at + MS // 2)
+        if runs and k <= N:
+            r.receive(DETECT, 2, at + 3 * MS, at + 5 * MS, stamp, pid=2)
+    result, _ = result_of(r.write(but=gone), loads(CAMERA, 'graph.yaml'))
+    camera = result['dags']['/camera']
+    assert (camera['ends']['completed'], camera['ends']['expired'], camera['unjudged']) == ends
+
+
+def test_publications_of_unknown_publishers_are_counted(recorded, graph):
+    made = [place for place, name in enumerate(recorded.names()) if name.endswith('lisher_init')]
+    whole, warnings = result_of(recorded.write(), graph)
+    assert warnings == []
+    result, warnings = result_of(recorded.write(but=made[-1:]), graph)
+    assert warnings == [f'{N} publications of a publisher whose initialisation is not in it, so '
+                        f'of no topic: process 2 ({N})']
+    assert len(result['communications']) == len(whole['communications']) - 1
+
+
 def test_late_and_off_the_grid(tmp_path):
     graph = loads('mddag: 1\nnodes:\n  - node: /n\n    callbacks:\n'
                   '      - {name: t, timer: 10ms, deadline: 5ms}\n', 'graph.yaml')

@@ -155,20 +155,27 @@ def test_an_execution_that_raised_has_failed(tmp_path, graph):
     assert (ends['failed'], ends['completed']) == (2, N - 2)
 
 
-def test_a_process_that_both_have_recorded_counts_once(tmp_path, graph):
+@pytest.mark.parametrize('executions', [False, True])
+def test_a_process_that_both_have_recorded_counts_once(tmp_path, graph, executions):
+    """The middleware has tracepoints, and a program may have those of executions as well."""
     own = detector(tmp_path / 'own.mcap')
     r = robot(tmp_path / 'lttng.mcap')
     r.add('mddag:host', 0, 7, 'robot', 'boot', 0, pid=2)
     r.node(9, '/detect', pid=2)
     r.publisher(77, 9, '/boxes', pid=2)
+    r.subscription(DETECT, 9, '/image', pid=2)
     for k in range(1, N + 1):
-        r.add('ros2:rcl_publish', k * 100 * MS + 9 * MS, 7, 77, 1, pid=2)
-        r.add('ros2:rmw_publish', k * 100 * MS + 9 * MS, 7, 1, 5, pid=2)
+        at = k * 100 * MS
+        if executions:
+            r.receive(DETECT, 7, at + 4 * MS, at + 10 * MS, at + 2010 * US, 'take', pid=2)
+        r.add('ros2:rcl_publish', at + 9 * MS, 7, 77, 1, pid=2)
+        r.add('ros2:rmw_publish', at + 9 * MS, 7, 1, 5, pid=2)
     result = replay([own, str(r.write())], graph).result()
     line, = result['warnings']
-    assert line == (f'{tmp_path}/lttng.mcap: left out: 20 events of process 2, because {own} has '
-                    'recorded it as well, and with its executions')
+    assert line == (f'{tmp_path}/lttng.mcap: left out: {50 if executions else 20} events of '
+                    f'process 2, because {own} has recorded it as well, and with its executions')
     assert sink(result)['response_ns'] == same(15 * MS)
+    assert result['callbacks']['/detect:detect']['executions'] == N
 
 
 @pytest.mark.parametrize('boot', ['boot', 'other'])
