@@ -53,7 +53,7 @@ def events_of(path):
 
 
 def write_events(events, target, chunk=None):
-    """Write events, so many to a chunk; numbers are of 64 bits."""
+    """Write events, a number of them into each chunk; all numbers have 64 bits."""
     with TraceFile(target, overwrite=True) as file:
         for place, ((name, names), time, pid, tid, *values) in enumerate(events, 1):
             provider, _, short = name.partition(':')
