@@ -41,22 +41,26 @@ class Bypass:
     :ivar is_open: whether short undeclared callbacks run past the core now.
     :ivar queue: those that wait.
     :ivar running: the one that runs; None: there is none.
-    :ivar n_entered: how many have waited here so far.
     """
 
-    __slots__ = ('is_open', 'queue', 'running', '_running_since', 'n_entered')
+    __slots__ = ('is_open', 'queue', 'running', '_running_since', '_next_id')
 
     def __init__(self) -> None:
         self.is_open = False
         self.queue: deque[Work] = deque()
         self.running: Work | None = None
         self._running_since = 0
-        self.n_entered = 0
+        self._next_id = -2
+
+    @property
+    def n_entered(self) -> int:
+        """Return how many executions have waited here so far."""
+        return -2 - self._next_id
 
     def enter(self, work: Work) -> None:
         """Let an execution wait."""
-        self.n_entered += 1
-        x = work.x = -1 - self.n_entered
+        x = work.x = self._next_id
+        self._next_id = x - 1
         entity = work.entity
         entity.waiting[x] = None
         entity.ready += 1

@@ -148,10 +148,6 @@ class DueTimes:
         self._agenda.set(Call(self._pool.unlocked_calls, function), at, at)
         self.arm_by(at)
 
-    def is_due(self, now: int) -> bool:
-        """Return whether there is anything to ``handle``."""
-        return (self._timer.at <= now or self._agenda.next <= now or self._timers.has_jumped)
-
     def handle(self, now: int, since: int) -> None:
         """
         Handle everything due by now; calls wait until the lock is free.
@@ -202,11 +198,8 @@ class DueTimes:
         elif self._pool.running and self._pool.engine.is_busy:
             self.arm_by(self._next_look(now))
 
-    def rest(self, now: int) -> None:
-        """Set the time for a thread that has nothing to run."""
-        if self._holders or not self._pool.polling or not self._pool.running:
-            self.arm(now)
-            return
+    def arm_idle(self, now: int) -> None:
+        """Set the time at which a thread in the epoll wakes up; no callback computes."""
         if self.check.entry:
             self.check.note(now)  # what was to be checked has ended
         first = self._agenda.next

@@ -22,8 +22,9 @@ that times never decrease.  The engine and ``other_processes`` change the core's
     may complete the vertex of one (``answers``).
 3.  *The core decides* what to run, and handles the ends of executions (``finished``,
     ``suspended``, ``refused``, …): see ``core.rules``.  After all events of a turn are reported,
-    ``step`` returns instructions: what to run, whether another thread may start something, and
-    when to look again.  What else is read from outside is ``interpreter``.
+    ``step`` returns instructions: what to run, and how long others may wait for it.  Then
+    ``may_start_more`` says whether another thread may start something.  What else is read from
+    outside is ``interpreter``.
 4.  *The bypass.*  While nothing is waiting, running or owning a callback group in the core, short
     undeclared callbacks run past it, as it would choose the same (``bypass``).
 5.  *Further decisions* of the core (verdicts, ends of jobs, executions dropped for newer ones) are
@@ -104,11 +105,10 @@ class Step:
     :ivar is_short: whether it usually ends soon; this and what follows only if there is one:
     :ivar patience_ns: how long what waits, or may come, may wait for a short execution to end.
     :ivar n_idle: how many workers run nothing.
-    :ivar overtaken: the executions that are to pause; this and what follows always:
-    :ivar more: whether another thread may start an execution now.
+    :ivar overtaken: the executions that are to pause; this one always.
     """
 
-    __slots__ = ('work', 'is_short', 'overtaken', 'more', 'n_idle', 'patience_ns')
+    __slots__ = ('work', 'is_short', 'overtaken', 'n_idle', 'patience_ns')
 
     def __init__(self, is_short: bool = False, n_idle: int = 0) -> None:
         self.work: Work | None = None
@@ -116,7 +116,6 @@ class Step:
         self.patience_ns = NET_NS
         self.n_idle = n_idle
         self.overtaken: Sequence[Work] = ()
-        self.more = False
 
 
 class Engine:
@@ -183,7 +182,9 @@ class Engine:
         self._ended = NEVER
         self.interpreter = Interpreter(self.tables, self._state)
         self._holders = self.interpreter.holders
-        self._step, self._nothing = Step(), Step()
+        self._step = Step()
+        #: what ``step`` returns if nothing waits
+        self.no_step = Step()
         self._past_core = Step(is_short=True, n_idle=n_workers - 1)
         urgency = self.scheduler.policy.urgency
         self._keys_are_times = urgency != OTHER_KEYS
@@ -534,12 +535,11 @@ class Engine:
         """Return whether any execution waits, except for its callback group."""
         return bool(self._bypass.queue) or has_waiting(self._state)
 
-    def step(self, worker: int, now: int, others_wait: bool = True) -> Step:
+    def step(self, worker: int, now: int) -> Step:
         """
         Choose the next execution for a worker that runs nothing, after all events up to now.
 
         :param worker: the worker to use if it is idle; else the lowest idle one is used.
-        :param others_wait: whether a thread waits for events, which can start more at once.
         """
         bypass = self._bypass
         if bypass.queue:
@@ -549,40 +549,22 @@ class Engine:
                     self._collect_more(work.entity)
                 step = self._past_core
                 step.work = work
-                if bypass.queue:
-                    step.patience_ns = self.interpreter.patience()
-                    step.more = others_wait and self._may_start_more(now)
-                else:
-                    step.patience_ns = NET_NS
-                    step.more = False
+                step.patience_ns = self.interpreter.patience() if bypass.queue else NET_NS
                 return step
         elif not (self._ready or self._deferred):  # nearly every second time
-            return self._nothing
+            return self.no_step
         step = self._step
         step.overtaken = ()
         work = step.work = self._dispatch(worker, now)
         step.n_idle = self._scalars[N_IDLE]  # nothing runs past the core any more
-        is_short = False
         if work is not None:
-            is_short = step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
+            step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
         if len(self._holders) > 1:
             self.interpreter.reorder()
             if self.interpreter.pauses:
                 step.overtaken = self.interpreter.overtaken
-        if self._ready or self._deferred or bypass.queue:
-            step.patience_ns = self.interpreter.patience()
-            step.more = (others_wait or not is_short) and self._may_start_more(now)
-        else:
-            step.patience_ns = NET_NS
-            step.more = False
-        return step
-
-    def advice(self, now: int) -> Step:
-        """Return what other threads are to do, after all events up to now."""
-        step = self._step
-        step.work = None
-        step.overtaken = ()
-        step.more = self.has_waiting and self._may_start_more(now)
+        waits = self._ready or self._deferred
+        step.patience_ns = self.interpreter.patience() if waits else NET_NS
         return step
 
     def patience(self) -> int:
@@ -666,7 +648,8 @@ class Engine:
                 rad_offset[vertex] for vertex, _ in entity.targets.values()), default=0)
         return deadline // 2  # its job was released before it arrived
 
-    def _may_start_more(self, now: int) -> bool:
+    def may_start_more(self, now: int) -> bool:
+        """Return whether another thread may start an execution now; True if in doubt."""
         if self._bypass.is_open:
             if self._bypass.running is None or not self._bypass.queue:
                 return bool(self._bypass.queue)
@@ -754,7 +737,8 @@ class Engine:
         entity.busy_ns += end - start
         if work is self._bypass.running:
             self._bypass.running = None
-            entity.failed += failed
+            if failed:
+                entity.failed += 1
             if self._records is not None:
                 self._records.run(work, -1, start, end, vtid, worker)
             return

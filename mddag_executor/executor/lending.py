@@ -67,7 +67,7 @@ class Pool(Protocol):
     def call(self) -> None:
         """Wake a thread."""
 
-    def wake_for(self, step: Step, now: int) -> None:
+    def wake_for(self, now: int) -> None:
         """Wake a thread if it may start an execution."""
 
     def wake_for_more(self) -> None:
@@ -143,11 +143,12 @@ class Lending:
             is_first = engine.rejoin(work, now)
             self.rejoining[work] = me
             # another thread chooses callbacks that wait already, as this one cannot run them
-            step = engine.step(me.worker, now) if is_first else engine.advice(now)
-            if step.work is not None:
-                self.hand_over(step)
+            if is_first:
+                step = engine.step(me.worker, now)
+                if step.work is not None:
+                    self.hand_over(step)
             if pool.polling:
-                pool.wake_for(step, now)
+                pool.wake_for(now)
             else:
                 pool.call()
         checks: dict[WorkerThread, GilCheck] = {}

@@ -36,6 +36,7 @@ from rclpy.qos import HistoryPolicy
 
 _MOST_FOREIGN = 8
 """This many responses to other clients are expected before the first own one."""
+_ONCE = range(1)
 SERVICE_DEPTH = 10
 """How many requests wait in Python at most: the depth of rclpy's default profile for services."""
 
@@ -69,7 +70,7 @@ class ArrivalEntity(ListenerEntity):
                 return  # another executor may have it now
             most = self.most_waiting
             misses = (left if left < MANY else _MOST_FOREIGN) if self.hears_others else 1
-            for _ in range(left if left < MOST else MOST):
+            for _ in _ONCE if left == 1 else range(min(left, MOST)):
                 if most and most <= len(self.waiting):
                     self.collect_more = partial(self.collect, MANY)
                     return

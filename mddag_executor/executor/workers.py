@@ -115,7 +115,7 @@ class WorkerPool:
         #: functions to call when the calling thread does not own the lock
         self.unlocked_calls: deque[Callable[[], None]] = deque()
         self.loop = EventLoop()
-        self._channels = self.loop.channels
+        self._channels, self._timer = self.loop.channels, self.loop.timer
         self.parking = Parking()
         self.announcements: Announced | None = None
         self.agenda = Agenda()
@@ -273,11 +273,11 @@ class WorkerPool:
         if running is not None and running.pool is self and running.is_short():
             self.due.arm_by(self.now - self.offset + self.engine.patience())
         else:
-            self.wake_for(self.engine.advice(self.now), self.now)
+            self.wake_for(self.now)
 
-    def wake_for(self, step: Step, now: int) -> None:
+    def wake_for(self, now: int) -> None:
         """Wake a thread if it may start an execution, or check what that has to wait for."""
-        if step.more:
+        if self.engine.may_start_more(now):
             self.call()
         elif self.engine.idle_workers:
             self.due.check.begin_if_wanted(now - self.offset)
@@ -498,24 +498,26 @@ class WorkerPool:
     def become(self, me: WorkerThread, state: ThreadState) -> None:
         """Change the state of a thread; the caller holds the lock."""
         before = me.state
-        if before is state:
-            return
         if state not in before.next:
+            if before is state:
+                return
             raise InvariantError(
                 [f'a thread that was {before.value} is {state.value}', *self._story()])
         me.state = state
         self._history.append((self.now, me.name, state))
-        if state is _WAITING:
-            self.polling += 1
-            me.waits_since = self.now
-        elif state is _PARKED:  # a visitor never is
-            self._n_parked += 1
         if before is _WAITING:
             self.polling -= 1
+            if state is _PARKED:  # a visitor never is
+                self._n_parked += 1
             if self._leaving and not self.polling:
                 self._all_left.set()
-        elif before is _PARKED:
-            self._n_parked -= 1
+        elif state is _WAITING:
+            self.polling += 1
+            me.waits_since = self.now
+            if before is _PARKED:
+                self._n_parked -= 1
+        else:
+            self._n_parked += (state is _PARKED) - (before is _PARKED)
 
     # --- a turn ----------------------------------------------------------------------------------
 
@@ -558,8 +560,8 @@ class WorkerPool:
         for fd, _ in events:
             for source in self._channels.get(fd, ()):
                 source.collect()
-        # a recorded message is later than the turn began
-        if self.due.is_due(self.now - self.offset):
+        now = self.now - self.offset  # a recorded message is later than the turn began
+        if self._timer.at <= now or self.agenda.next <= now or self.timers.has_jumped:
             self.due.handle(
                 self.now, self.now if me is None or me.state is not _WAITING else me.waits_since)
 
@@ -653,16 +655,16 @@ class WorkerPool:
         """Set the next execution, or where to wait; return whether there is an execution."""
         # a worker whose callback outlasts a spin leaves the rest to the thread of a spin_once
         if self.running and (not self.is_spin_once or me.thread is None):
-            step = self._next_step(me.worker, now, self.polling > (me.state is _WAITING))
+            step = self._next_step(me.worker, now)
             if self._rejoining:
                 step = self._hand_over(me, step, now)
         else:
-            step = self.engine.advice(now)
+            step = self.engine.no_step
         work = step.work
         if step.overtaken:
             self.pauses.begin(step.overtaken, None if work is None else me)
         if work is None:
-            self._rest(me, step.more, now)
+            self._rest(me, now)
             return False
         me.work = work
         step.work = None  # else it would keep the message
@@ -681,7 +683,7 @@ class WorkerPool:
         """Let executions go on that were dispatched again; return the step after these."""
         while step.work in self._rejoining:
             self.lending.hand_over(step)
-            step = self._next_step(me.worker, now, self.polling > (me.state is _WAITING))
+            step = self._next_step(me.worker, now)
         return step
 
     def _share_events(self, me: WorkerThread, step: Step, now: int) -> None:
@@ -693,38 +695,36 @@ class WorkerPool:
         if self.is_spin_once:
             due.arm(now - self.offset)
         elif self.polling:
-            if step.more:
+            if self.engine.may_start_more(now):
                 self.call()
-            elif self.agenda.next < self.loop.timer.at:
+            elif self.agenda.next < self._timer.at:
                 due.arm(now - self.offset)
         elif step.n_idle:
-            if me.is_spare or self._eager or step.more:
+            if me.is_spare or self._eager or self.engine.may_start_more(now):
                 self.call()
             else:
                 due.arm_look(now - self.offset)
 
-    def _rest(self, me: WorkerThread, more: bool, now: int) -> None:
-        """
-        Let a thread without an execution wait for events, or park it.
-
-        :param more: whether another thread may start an execution now.
-        """
+    def _rest(self, me: WorkerThread, now: int) -> None:
+        """Let a thread without an execution wait for events, or park it."""
         if self._deadlines.next < NEVER or self._overdue.deadline < NEVER:
             self._overdue.update()
         if self._verdicts.missed != self._misses:
             self._note_misses()
         if me.thread is not None:  # else a visitor: the thread of a spin_once
-            others = self.polling - (me.state is _WAITING)
             state = _PARKED
             # while a callback computes, its thread handles the events when it ends
-            if self.running and not self.is_spin_once and not self._closed and (
-                    not self._holders or self._eager) and (
-                    not others or me.is_spare and others < self.engine.idle_workers):
-                state = _WAITING
+            if self.running and not self.is_spin_once and (not self._holders or self._eager):
+                others = self.polling - (me.state is _WAITING)
+                if not others or me.is_spare and others < self.engine.idle_workers:
+                    state = _WAITING
             self.become(me, state)
-            if more and self.is_spin_once:
+            if self.is_spin_once and self.engine.may_start_more(now):
                 self.call()
-        self.due.rest(now - self.offset)
+        if self._holders or not self.polling or not self.running:
+            self.due.arm(now - self.offset)
+        else:
+            self.due.arm_idle(now - self.offset)
 
     def threads(self) -> list[WorkerThread]:
         """Return all threads that run callbacks, from any thread."""

@@ -466,16 +466,16 @@ def test_a_step_says_what_other_threads_are_to_do():
     for entity in (first, second):
         engine.ready(Work(entity, print), 0)
     step = engine.step(0, 0)
-    assert step.work.entity is first and step.more and step.n_idle == 2
+    assert step.work.entity is first and step.n_idle == 2 and engine.may_start_more(0)
     step = engine.step(1, 0)
-    assert step.work.entity is second and not step.more and step.n_idle == 1
+    assert step.work.entity is second and step.n_idle == 1 and not engine.may_start_more(0)
     first.wall_ns = second.wall_ns = 1000
     for entity in (first, second):
         engine.ready(Work(entity, print), 0)
-    step = engine.step(2, 0, others_wait=False)     # its thread will be free in time
-    assert step.is_short and not step.more and step.n_idle == 0
+    step = engine.step(2, 0)
+    assert step.is_short and step.n_idle == 0
     assert step.patience_ns == 4 * MS
-    assert not engine.advice(0).more and engine.advice(0).work is None
+    assert not engine.may_start_more(0)
 
 
 def test_a_step_says_what_is_overtaken_and_when_the_next_deadline_is():
@@ -545,7 +545,7 @@ def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
         elif step in running:
             engine.finished(running.pop(step), now, now, now, 0, step)
             begun.append(engine.step(step, now).work)
-        while begun and engine.advice(now).more and (len(begun) == 1 or begun[-1] is not None):
+        while begun and engine.may_start_more(now) and (len(begun) == 1 or begun[-1] is not None):
             begun.append(engine.step(0, now).work)
         running |= {work.worker: work for work in begun if work is not None}
         check(engine)
@@ -666,7 +666,7 @@ def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
         pool.running, pool.polling = True, 1
         for ms, look in ((100, 104), (101, 103), (102, 120), (110, 112)):
             watch.arm(begin + look * MS)
-            due.rest(begin + ms * MS)
+            due.arm_idle(begin + ms * MS)
             found.append(watch.at if watch.at == NEVER else (watch.at - begin) // MS)
         pool.running, pool.polling = False, 0
     assert found == [NEVER, 121, 120, NEVER]
@@ -740,7 +740,7 @@ class Steps:
         engine = self.engine
         return (
             started and (started.args, started.worker), engine.queue_length, engine.has_waiting,
-            engine.idle_workers, engine.advice(now).more,
+            engine.idle_workers, engine.may_start_more(now),
             [(len(each.waiting), each.ran, each.dropped, each.skipped, each.failed)
              for each in self.entities])
 
