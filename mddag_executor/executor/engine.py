@@ -553,9 +553,18 @@ class Engine:
                 return step
         elif not (self._ready or self._deferred):  # nearly every second time
             return self.no_step
-        step = self._step
+        if bypass.is_open:
+            self._end_bypass()
+        step, state = self._step, self._state
+        if state.worker_x[worker] >= 0:
+            worker = state.worker_x.index(-1) if self._scalars[N_IDLE] else -1
+        work = None
+        if worker >= 0:
+            if self._holders:
+                state.overtaking[1] = self.interpreter.may_be_overtaken(now)
+            work = self._start_next(worker, now)
+        step.work = work
         step.overtaken = ()
-        work = step.work = self._dispatch(worker, now)
         step.n_idle = self._scalars[N_IDLE]  # nothing runs past the core any more
         if work is not None:
             step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
@@ -579,18 +588,6 @@ class Engine:
         patience = self.interpreter.patience() if waits else NET_NS
         # it is not known yet whether a holder really computes: half the time
         return patience // 2 if self._holders else patience
-
-    def _dispatch(self, worker: int, now: int) -> Work | None:
-        if self._bypass.is_open:
-            self._end_bypass()
-        state = self._state
-        if state.worker_x[worker] >= 0:
-            if not self._scalars[N_IDLE]:
-                return None
-            worker = state.worker_x.index(-1)
-        if self._holders:
-            state.overtaking[1] = self.interpreter.may_be_overtaken(now)
-        return self._start_next(worker, now)
 
     @staticmethod
     def _collect_more(entity: Entity) -> None:

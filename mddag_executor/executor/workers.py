@@ -44,7 +44,6 @@ from typing import Any, TYPE_CHECKING
 import weakref
 
 from mddag_executor.clocks import TraceClock
-from mddag_executor.core import NEVER
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.bounds import (
     AGAIN_NS,
@@ -127,7 +126,7 @@ class WorkerPool:
         self._paused = self.pauses.paused
         engine.interpreter.pauses = can_pause()
         self._next_step = engine.step
-        self._deadlines = engine.deadlines
+        self._judges = engine.tables.n_dags > 0
         self._interpreter = engine.interpreter
         self._holders = engine.interpreter.holders
         self.lending = Lending(self)
@@ -174,7 +173,6 @@ class WorkerPool:
         self._loops: Loops | None = None
         self.now = 0
         self.due = DueTimes(self)
-        self._overdue = self.due.overdue
         #: counts messages that no declared callback has published; None: nothing is declared
         self.outside: Outside | None = None
 
@@ -477,19 +475,18 @@ class WorkerPool:
         wait, park, receive, go_on, execute = (
             self.loop.wait, self.parking.wait, self._receive, self._go_on, me.execute)
         current.running = me
-        found = False
         while True:
-            if found:
-                execute()
-                found = go_on(me)
-            elif me.state is _PARKED:
+            if me.state is not _PARKED:
+                found = receive(me, wait())
+            else:
                 if not self._closed:
                     park()
                 if self._closed:
                     return
                 found = receive(me, None)
-            else:
-                found = receive(me, wait())
+            while found:
+                execute()
+                found = go_on(me)
 
     def _story(self) -> list[str]:
         return [f'{(at - self.now) / 1e6:+.3f} ms {name} {state.value}'
@@ -707,10 +704,10 @@ class WorkerPool:
 
     def _rest(self, me: WorkerThread, now: int) -> None:
         """Let a thread without an execution wait for events, or park it."""
-        if self._deadlines.next < NEVER or self._overdue.deadline < NEVER:
-            self._overdue.update()
-        if self._verdicts.missed != self._misses:
-            self._note_misses()
+        if self._judges:
+            self.due.overdue.update()
+            if self._verdicts.missed != self._misses:
+                self._note_misses()
         if me.thread is not None:  # else a visitor: the thread of a spin_once
             state = _PARKED
             # while a callback computes, its thread handles the events when it ends
