@@ -166,7 +166,7 @@ class SubscriptionEntity(ArrivalEntity):
         pool, gaps = self.rooms.pool, self._gaps
         number = taken[1].get('publication_sequence_number')
         if number == gaps.expected:
-            gaps.expected += 1
+            gaps.expected = number + 1
         elif missing := gaps.missing(number):
             pool.engine.messages_lost(self, missing, pool.now)
         work = Work(self, self.rclpy_object.callback, taken if self._with_info else (taken[0],))

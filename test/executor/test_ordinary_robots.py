@@ -465,6 +465,7 @@ def test_a_draft_knows_a_sync_of_one_rate_and_timers_that_are_reset(
         assert wait_for(lambda: robot.barks > 30 and robot.dogs[1].is_canceled())
         robot.timer.cancel()
         assert wait_for(lambda: is_idle(executor))
+    skipped = sum(each['skipped'] for each in executor.statistics()['callbacks'].values())
     executor.shutdown()
     text = declaration_of(System(path).draft(), accepted=True)
     assert 'sync: [/l, /r]  # proposed: /cloud has the header stamps of /l and /r' in text
@@ -472,8 +473,9 @@ def test_a_draft_knows_a_sync_of_one_rate_and_timers_that_are_reset(
     found = replay(path, loads(text.replace('deadline: ', 'deadline: 9s  # '))).result()
     assert not found.get('drift')
     completed, not_due, late, expired = verdicts(found)['/dog:on_cloud']
-    # the last pair may not have been complete
-    assert (robot.pairs - completed in (0, 1), not_due, late, expired <= 1) == (True, 0, 0, True)
+    # the last pair may not have been complete, and a busy machine skips releases
+    assert (robot.pairs - completed in (0, 1), not_due, late) == (True, 0, 0)
+    assert expired <= 1 + skipped
 
 
 MADE_AGAIN = graph(
