@@ -151,8 +151,8 @@ class PublisherState:
     The state of a publisher: its topic, and how many messages it has published.
 
     :ivar address: the publisher's address in a trace.
-    :ivar is_tracked: whether a declared callback has published a trigger topic with it, which
-        starts the counting of its publications.
+    :ivar is_tracked: whether its publications are counted: since it was first used, by any
+        thread, for a topic that a declared callback publishes.
     :ivar sending: the publication that is being sent.
     :ivar recorded_by: the number of the recorder that has last recorded it; 0: none.
     :ivar lock: serialises the publications of a trigger topic; reentrant, as a signal handler may

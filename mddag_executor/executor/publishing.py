@@ -275,6 +275,8 @@ def _send_outside(
             if claim is None:
                 _note_outside(pool, publisher, state, '')
     if claim is None:
+        if watching is not None:  # a callback may publish with it later
+            state.is_tracked = True
         if state.is_tracked:
             _send_counted(original, publisher, msg, state)
         else:

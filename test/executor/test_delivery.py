@@ -156,6 +156,33 @@ def test_messages_of_this_process_and_of_another_one_come_all_and_in_order(
     assert {*declared} == {('fore', True), ('main', True), ('here', False)}
 
 
+def test_the_first_message_of_a_callback_has_a_job_though_others_were_sent_before(
+        make_executor, make_node):
+    """By its publisher, outside of callbacks; only its number says which of two messages it is."""
+    node, jobs = make_node('here'), []
+    publisher, other = (node.create_publisher(Header, '/a', 10) for _ in range(2))
+
+    def tick():
+        other.handle.publish(Header(frame_id='other'))  # as a publisher of another process
+        publisher.publish(Header(frame_id='here'))
+        timer.cancel()
+
+    timer = node.create_timer(0.01, tick, autostart=False)
+    node.create_subscription(
+        Header, '/a', lambda m: jobs.append((m.frame_id, current_job() is not None)), 10)
+    executor = make_executor(loads(graph(here="""
+        name: tick, timer: 10ms, publishes: [/a]
+        name: hear, subscription: /a, deadline: 60s""")), nodes=[node], default_deadline='60s')
+    with Spinning(executor):
+        matched(publisher, other)
+        publisher.publish(Header(frame_id='main'))
+        assert wait_for(lambda: jobs)
+        timer.reset()
+        executor.wake()
+        assert wait_for(lambda: len(jobs) == 3)
+    assert sorted(jobs) == [('here', True), ('main', False), ('other', False)]
+
+
 def numbers(got, name):
     return [int(text.split(':')[1]) for text in got if text.startswith(f'{name}:')]
 
