@@ -6,7 +6,8 @@ What an output may replace: the one rule for all verbs and for the Python API.
 1. A recording cannot be made again, and a declaration may have been edited. So a new recording or
    declaration replaces no file unless the user asks for it: `--overwrite` on the command line,
    `overwrite=True` in Python. No other output replaces a file that holds a recording or is named
-   like a declaration.
+   like a declaration. A recording that is still being written is never replaced, as two writers of
+   one file would damage both recordings: the writer locks the file (`flock`) until it closes it.
 2. An output is never an input of the same command, and no two outputs are the same file.
 3. Other results (tables, pictures) replace what was there, as with every tool.
 4. Pipes, devices and empty files hold nothing that could be lost.
@@ -19,7 +20,8 @@ What an output may replace: the one rule for all verbs and for the Python API.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+import fcntl
 from itertools import count
 import os
 from pathlib import Path
@@ -29,6 +31,8 @@ from typing import BinaryIO, cast
 from mddag_executor.errors import InputError, UsageError
 
 EXISTS = 'there is a file already'
+IS_WRITTEN = 'another run is writing this file'
+REMEDY_IF_WRITTEN = 'name another file, or end that run first'
 REMEDY = 'name another file, or replace this one with --overwrite (in Python overwrite=True)'
 _RECORDINGS = (b'\x89MCAP', b'SQLite format 3\0')
 _ENDINGS = ('.mcap', '.db3')
@@ -41,6 +45,8 @@ def check_replaced(path: str, *, is_kept: bool, overwrite: bool = False) -> None
 
     :param is_kept: whether the output is a recording or a declaration.
     """
+    if is_kept and _is_locked(path):
+        raise InputError(path, IS_WRITTEN, REMEDY_IF_WRITTEN)
     if overwrite or not holds_data(path):
         return
     if is_kept:
@@ -76,13 +82,56 @@ def check_parent(path: str) -> None:
 
 
 def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
-    """Open a new recording for writing, unbuffered, or raise FileExistsError (rule 1)."""
+    """
+    Open a new recording for writing, unbuffered, and lock it (rule 1).
+
+    :raises FileExistsError: if it would replace a file.
+    :raises BlockingIOError: if another writer has locked it.
+    """
     try:
-        return cast(BinaryIO, open(path, 'xb', buffering=0))
+        stream = cast(BinaryIO, open(path, 'xb', buffering=0))
     except FileExistsError:
         if not overwrite and holds_data(path):
             raise
-        return cast(BinaryIO, open(path, 'wb', buffering=0))
+        if is_special(path):
+            return cast(BinaryIO, open(path, 'wb', buffering=0))
+        # not emptied before it is locked
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        stream = cast(BinaryIO, open(number, 'wb', buffering=0))
+    if not _lock(stream, fcntl.LOCK_EX):
+        stream.close()
+        raise BlockingIOError
+    stream.truncate()
+    return stream
+
+
+def close_recording(stream: BinaryIO) -> None:
+    """Close a new recording, and unlock it: a forked process may have it open as well."""
+    with suppress(OSError):
+        fcntl.flock(stream, fcntl.LOCK_UN)
+    stream.close()
+
+
+def _lock(file: BinaryIO, kind: int) -> bool:
+    """Lock a file; return False if its writer has locked it."""
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:     # this file system has no locks
+        pass
+    return True
+
+
+def _is_locked(path: str) -> bool:
+    """Return whether a recording is still being written."""
+    if is_special(path):
+        return False
+    try:
+        with open(path, 'rb') as file:
+            return not _lock(file, fcntl.LOCK_SH)
+    except (OSError, ValueError):   # there is none, or it cannot be read
+        return False
 
 
 @contextmanager

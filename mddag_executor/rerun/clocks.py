@@ -231,7 +231,13 @@ class VirtualTime:
 
 
 class _VirtualLock:
-    """A lock of a run thread, which waits for it in virtual time."""
+    """
+    A lock of a run thread, which waits for it in virtual time.
+
+    At the end of the run, a wait without a timeout returns although nothing has released the lock.
+    ``Condition`` keeps such a lock in its list of waiters. The lock is then free, so
+    ``Condition.notify`` gets the error of a free lock, and wakes the next waiter instead.
+    """
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
@@ -240,8 +246,10 @@ class _VirtualLock:
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
         timeout_s = 0.0 if not blocking else None if timeout < 0 else timeout
         acquired = self._loop.wait(lambda: not self._locked, timeout_s, 'for another thread')
-        self._locked = True
+        self._locked = acquired or timeout_s is not None
         return acquired
 
     def release(self) -> None:
+        if not self._locked:
+            raise RuntimeError('release unlocked lock')
         self._locked = False

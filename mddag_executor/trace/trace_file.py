@@ -45,10 +45,13 @@ from mcap.records import (
     Statistics,
 )
 from mddag_executor.output_rules import (
+    close_recording,
     create_recording,
     EXISTS,
     holds_data,
+    IS_WRITTEN,
     REMEDY,
+    REMEDY_IF_WRITTEN,
     whole_file,
 )
 from mddag_executor.trace import cdr, records
@@ -183,6 +186,8 @@ class TraceFile:
             self._stream = create_recording(self.path, overwrite)
         except FileExistsError:
             raise TraceError(self.path, EXISTS, REMEDY) from None
+        except BlockingIOError:
+            raise TraceError(self.path, IS_WRITTEN, REMEDY_IF_WRITTEN) from None
         except (OSError, ValueError) as error:
             reason = getattr(error, 'strerror', None) or str(error)
             raise TraceError(self.path, f'cannot be written ({reason})',
@@ -383,7 +388,7 @@ class TraceFile:
         footer = written(Footer(summary_start, 0, 0))[:-4]
         crc = zlib.crc32(summary + footer)      # from the summary's start to the CRC itself
         self._write(summary + footer + records.UINT32.pack(crc) + records.MAGIC)
-        self._stream.close()
+        close_recording(self._stream)
 
     def _summary(self) -> bytes:
         defined = [channel for channel in self._in_order if not channel.undefined]
@@ -401,7 +406,7 @@ class TraceFile:
 
     def abandon(self) -> None:
         """Close the file without unwritten events, summary and footer."""
-        self._stream.close()
+        close_recording(self._stream)
 
     def _write(self, data: bytes) -> None:
         rest = memoryview(data)
@@ -421,7 +426,7 @@ class TraceFile:
             self._stream.truncate(self._offset)
         except (OSError, ValueError):
             pass        # not a plain file, or removed: readers can handle a truncated chunk
-        self._stream.close()
+        close_recording(self._stream)
 
     def __enter__(self) -> TraceFile:
         return self

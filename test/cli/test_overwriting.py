@@ -65,6 +65,31 @@ def test_in_python_no_recording_is_replaced(graph, call, ros_context):
     assert out.read_bytes().startswith(b'\x89MCAP')
 
 
+def test_a_recording_that_a_run_is_writing_is_not_replaced(graph, call, ros_context):
+    writer = TraceWriter('live.mcap')
+    writer.record('callback_end', 7, 8, 9)
+    error = 'live.mcap: another run is writing this file: name another file, or end that run first'
+    for verb in (f'run {graph} --synthetic sleep --duration 1s --trace',
+                 f'simulate {graph} --duration 1s --trace',
+                 f'import ctf {DEMO} -o'):
+        status, _, err = call(*verb.split(), 'live.mcap', '--overwrite')
+        assert status == 2 and err == f'error: {error}\n'
+    for make in (TraceFile, TraceWriter, lambda path, **options: MultiDeadlineExecutor(
+            trace=path, context=ros_context, **options)):
+        with pytest.raises(MddagError, match=error):
+            make('live.mcap', overwrite=True)
+    path = os.path.realpath('live.mcap')
+    forked = os.dup(next(int(number) for number in os.listdir('/proc/self/fd')
+                         if os.path.realpath(f'/proc/self/fd/{number}') == path))
+    try:    # a forked process may have it open as well
+        writer.close()
+        assert Path(path).read_bytes().endswith(b'\x89MCAP0\r\n')
+        with TraceFile(path, overwrite=True):
+            pass
+    finally:
+        os.close(forked)
+
+
 def test_a_failed_output_leaves_what_was_there(tmp_path):
     path = tmp_path / 'out.bin'
     path.write_bytes(b'before')

@@ -241,6 +241,24 @@ def test_threads_of_nodes_are_in_virtual_time_too(bag, graph):
     assert not result.warnings
 
 
+def test_a_pool_of_threads_can_be_shut_down_after_the_run(bag, graph):
+    # Python does so when it ends
+    pools = []
+
+    def fill(node):
+        pools.append(ThreadPoolExecutor(1))
+
+    def take(node, number):
+        node.note(pools[0].submit(lambda: number).result())
+
+    seen, _result = run_filter(bag, graph, take, fill=fill)
+    assert [number for _time, number in seen] == list(range(20))
+    ends = threading.Thread(target=pools[0].shutdown, daemon=True)
+    ends.start()
+    ends.join(30)
+    assert not ends.is_alive()
+
+
 def fibonacci(**more):
     """Return a node with an action that feeds back each 10 ms, and may be cancelled."""
     node = rclpy.create_node('fibonacci')
