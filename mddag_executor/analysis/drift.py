@@ -83,6 +83,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     for vertex in distinct(completed).tolist():
         came.pop(vertices[vertex].callback.key, None)   # it got all of them
     publishes: defaultdict[str, Set[str]] = defaultdict(set)
+    published: Counter[tuple[str, str]] = Counter()
     outside: Counter[tuple[str, str, str]] = Counter()
     sent = recording.publications
     publishers, publisher_of = different(sent['publisher'])
@@ -91,7 +92,9 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         callback_of, len(numbers))[sent['execution']]
     is_judged = (sent['time'] >= max(since, recording.run.judge_from)) & (
         sent['time'] <= recording.run.judged_until)
-    judged_counts = np.bincount(pair_of[is_judged], minlength=int(pair_of.max(initial=0)) + 1)
+    judged_counts, late_sent = (
+        np.bincount(pair_of[which], minlength=int(pair_of.max(initial=0)) + 1)
+        for which in (is_judged, sent['time'] >= since))
     for pair in np.flatnonzero(np.bincount(pair_of)).tolist():
         number, place = int(publishers[pair // (len(numbers) + 1)]), pair % (len(numbers) + 1)
         callback = int(numbers[place]) if place < len(numbers) else None
@@ -100,6 +103,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             continue
         if callback in keys:
             publishes[keys[callback]] |= {publisher.topic}
+            published[keys[callback], publisher.topic] += int(late_sent[pair])
         elif callback is not None or not recording.run.links:    # the events may be lost
             outside[publisher.node.name, publisher.topic, (
                 '' if callback is None else names.name(callback))] += int(judged_counts[pair])
@@ -110,7 +114,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
         [each.entity for each in names.made
          if each.entity is not None and each.number not in bound], periods, recording.end,
         _blocked(recording, keys),
-        [(*key, count) for key, count in outside.items() if count]))
+        [(*key, count) for key, count in outside.items() if count], published))
 
 
 def _blocked(recording: Recording, keys: Mapping[int, str]) -> set[str]:

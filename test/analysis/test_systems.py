@@ -317,6 +317,31 @@ nodes:
     assert (found[1].declared, found[1].observed) == (15 * MS, 10 * MS)
 
 
+@pytest.mark.parametrize(('sent', 'text'), [
+    (60, None),     # all but the first were lost
+    (20, "/b:x got 20 messages, and by the declaration 60 were due: if /a:tick published /x in 20 "
+         "of 60 runs, declare 'may_publish: [/x]'")])
+def test_a_publication_that_did_not_arrive_is_no_drift(tmp_path, sent, text):
+    r = Recorded(tmp_path / 'r.mcap')
+    r.node(100, '/a')
+    r.node(200, '/b')
+    r.publisher(110, 100, '/x')
+    r.timer(130, 100, 10 * MS)
+    r.subscription(230, 200, '/x')
+    for k in range(60):
+        at = 1_000 * MS + 10 * MS * k
+        ran(r, 130, 1, at, MS, *[110] * (k < sent))
+        if k < 20:
+            ran(r, 230, 3, at + 3 * MS, MS)
+    outcome = replay(r.write(), loads("""\
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: tick, timer: 10ms, publishes: [/x]}]}
+  - {node: /b, callbacks: [{name: x, subscription: /x, deadline: 5ms}]}
+"""))
+    assert [each.text for each in outcome.drift()] == [text] * (text is not None)
+
+
 def test_a_warm_up_does_not_count_for_rates(tmp_path):
     trace = Written(tmp_path / 'run.mcap', """\
 mddag: 1

@@ -78,6 +78,11 @@ WHEN_NEEDED = "if it is made, reset or cancelled when needed, declare 'sporadic:
             f": if /a:t published /x in {got} of 50 runs, declare 'may_publish: [/x]'"
             if got < 50 else '')])
       for got in (38, 62)),
+    # Messages that were published and did not arrive say nothing about the declaration.
+    ({'messages': {'/b:m': 20}, 'published': {('/a:t', '/x'): 40}}, []),
+    ({'messages': {'/b:m': 20}, 'published': {('/a:t', '/x'): 30}}, [
+        '/b:m got 20 messages, and by the declaration 50 were due: if /a:t published /x in 30 of '
+        "50 runs, declare 'may_publish: [/x]'"]),
     # Of consecutive callbacks the first that never ran is the reason.
     (never_ran('/b:m', '/b:s', '/b:e'), ['/b:m never ran in the 0.500 s after the first release']),
     (never_ran('/b:s', '/b:e'), [NO_E.replace('e', 's', 1), NO_E]),
