@@ -457,7 +457,8 @@ class System:
         elif callback.kind == 'timer' and count == 1 and (
                 'sporadic' not in callback.other_keys
                 and self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
-            callback.other_keys['once'] = 'true'
+            callback.other_keys['once'] = (
+                "true  # proposed: it fired once; for a timer that the node resets 'sporadic: true'")
         if callback.kind == 'sync':
             legs = [self._runs[number] for number, declared in self._declared.items()
                     if declared.key == callback.key and number in self._runs]

@@ -70,7 +70,7 @@ def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> R
         Part.make(folder, task_set.text, passed_on)
         names = [process.name for process in task_set.processes]
         _warn_of_contested(task_set, warn)
-        _warn_of_divided_paths(task_set, warn)
+        _warn_of_divided_paths(task_set, warn, options.trace is not None)
         new_folder = _make_folder(options.trace)
         for name in names:
             check_output(_trace(options.trace, name), is_kept=True, overwrite=options.overwrite)
@@ -125,10 +125,14 @@ def run_processes(options: RunOptions, task_set: TaskSet, display: Display) -> R
         warnings=tuple(warnings), has_started=has_started)
 
 
-def _warn_of_divided_paths(task_set: TaskSet, warn: Callable[[str], None]) -> None:
+def _warn_of_divided_paths(
+    task_set: TaskSet, warn: Callable[[str], None], is_recorded: bool
+) -> None:
+    remedy = ('judge its traces with mddag replay' if is_recorded
+              else 'record it with --trace, and judge its traces with mddag replay')
     for name in path_watch.divided(task_set):
         warn(f'path {name}: its callbacks run in several processes, so this run leaves it out: '
-             'record it with --trace, and judge it with mddag replay')
+             + remedy)
 
 
 def _warn_of_contested(task_set: TaskSet, warn: Callable[[str], None]) -> None:

@@ -189,6 +189,21 @@ def test_what_comes_when_it_is_needed_is_sporadic(tmp_path):
         '/plan', 1_000 * MS, True, 1_000 * MS)
 
 
+def test_a_timer_that_fired_once_may_be_reset(tmp_path):
+    r = Recorded(tmp_path / 'o.mcap')
+    r.node(100, '/motors')
+    r.timer(1, 100, 100 * MS)
+    r.timer(2, 100, 150 * MS)
+    for k in range(40):
+        ran(r, 1, 1, 1_000 * MS + 100 * MS * k, MS)
+    ran(r, 2, 1, 1_050 * MS, MS)
+    draft = System(r.write()).draft()
+    accept(draft)
+    text = declaration_of(draft, accepted=True)
+    assert [callback.once for callback in loads(text).callbacks] == [False, True]
+    assert "proposed: it fired once; for a timer that the node resets 'sporadic: true'" in text
+
+
 def test_two_clients_of_a_service_do_not_give_it_a_tiny_deadline(tmp_path):
     """Requests of both come together: the least time between two says nothing of deadlines."""
     r = Recorded(tmp_path / 'n.mcap')
