@@ -458,7 +458,7 @@ class System:
                 'sporadic' not in callback.other_keys
                 and self._end - int(runs.starts[0]) > ONCE_PERIODS * (callback.period_ns or DAY)):
             callback.other_keys['once'] = (
-                "true  # proposed: it fired once; for a timer that the node resets 'sporadic: true'")
+                "true  # proposed: it fired once; if the node resets it, 'sporadic: true'")
         if callback.kind == 'sync':
             legs = [self._runs[number] for number, declared in self._declared.items()
                     if declared.key == callback.key and number in self._runs]
