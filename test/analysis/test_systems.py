@@ -201,7 +201,7 @@ def test_a_timer_that_fired_once_may_be_reset(tmp_path):
     accept(draft)
     text = declaration_of(draft, accepted=True)
     assert [callback.once for callback in loads(text).callbacks] == [False, True]
-    assert "proposed: it fired once; for a timer that the node resets 'sporadic: true'" in text
+    assert "proposed: it fired once; if the node resets it, 'sporadic: true'" in text
 
 
 def test_two_clients_of_a_service_do_not_give_it_a_tiny_deadline(tmp_path):
