@@ -25,6 +25,8 @@ Places = npt.NDArray[np.int32]
 
 _PART = 1 << 16
 """Rows of a part of a table."""
+_MOST_GROWTH = 128
+"""How much longer a growing table becomes at most: a file may begin with most of its rows."""
 
 
 class Table:
@@ -172,6 +174,7 @@ class Growing:
         self._columns = {name: np.empty(0, dtype=kind[name]) for name in kind.names or ()}
         self._values = values
         self._count = self._capacity = 0
+        self._share = 1.0
 
     def __len__(self) -> int:
         return self._count
@@ -180,7 +183,7 @@ class Growing:
         """Add rows; return them as a view, which is valid until more are added."""
         before, self._count = self._count, self._count + n
         if self._count > self._capacity:
-            self._grow(max(1024, 2 * self._count))
+            self._grow(before)
         for name, values in {**self._values, **columns}.items():
             self._columns[name][before:self._count] = values
         return self.rows()[before:]
@@ -197,11 +200,21 @@ class Growing:
         """Return the table; no rows can be added afterwards."""
         return self.rows()
 
-    def _grow(self, capacity: int) -> None:
+    def expect(self, share: float) -> None:
+        """
+        Expect more rows, so that rows are seldom copied.
+
+        :param share: the share of all rows that are there after the next rows are added.
+        """
+        self._share = max(share, 1 / _MOST_GROWTH)
+
+    def _grow(self, filled: int) -> None:
         """Make room, which takes no memory before something is written to it."""
+        capacity = max(1024, 2 * self._count, int(1.1 * self._count / self._share))
         for name, column in self._columns.items():
             larger = np.zeros(capacity, dtype=column.dtype)
+            column = column[:filled]
             if column.any():
-                larger[:len(column)] = column
+                larger[:filled] = column
             self._columns[name] = larger
         self._capacity = capacity

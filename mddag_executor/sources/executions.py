@@ -118,11 +118,21 @@ class Batches:
         found: Ints = np.concatenate(values, dtype=np.int64, casting='unsafe')[self._order]
         return found
 
-    def rows(self, kind: np.dtype[Any], which: Any = slice(None)) -> Table:
-        """Return some events as rows of a type, which also has a column ``place``."""
+    def chosen(self, which: Ints) -> Batches:
+        """Return some of the events; only their fields are converted."""
         place = self.place[which]
-        return rows(kind, len(place), place=place, **{
-            name: self[name][which] for name in kind.names or () if name != 'place'})
+        at = which if isinstance(self._order, slice) else self._order[which]
+        parts, begin = [], 0
+        for table in self._tables:
+            mine = (at >= begin) & (at < begin + len(table))
+            parts.append((table[at[mine] - begin], place[mine]))
+            begin += len(table)
+        return Batches(parts)
+
+    def rows(self, kind: np.dtype[Any]) -> Table:
+        """Return the events as rows of a type, which also has a column ``place``."""
+        return rows(kind, len(self), place=self.place, **{
+            name: self[name] for name in kind.names or () if name != 'place'})
 
 
 class _Dispatches:
@@ -178,6 +188,11 @@ class ExecutionJoin:
             UNKNOWN))
         self._completed = Growing(COMPLETED)
 
+    def expect(self, share: float) -> None:
+        """Expect that the executions with the next events are a share of all."""
+        self._executions.expect(share)
+        self._completed.expect(share)
+
     def tables(self) -> tuple[Table, Table]:
         """Return ``executions``, and ``COMPLETED``; no events can be added afterwards."""
         self.add({}, at_end=True)
@@ -230,7 +245,7 @@ class ExecutionJoin:
         waits = (at >= 0) & (not at_end)
         waits[waits] = self._dispatches.is_newest[at[waits]]
         self._complete(complete, event[~waits], at[~waits])
-        self._waiting = complete.rows(self._waiting.dtype, np.sort(event[waits]))
+        self._waiting = complete.chosen(np.sort(event[waits])).rows(self._waiting.dtype)
 
     def _dispatch(self, dispatch: Batches) -> None:
         """Add dispatched executions."""
@@ -241,12 +256,14 @@ class ExecutionJoin:
             ready = np.where(strange, start, ready)
         dag, vertex = self._numbering.of(dispatch['dag'], dispatch['vertex'])
         thread, before = dispatch['vtid'], len(self._executions)
-        self._executions.more(
+        table = self._executions.more(
             len(dispatch), callback=dispatch['callback'], dag=dag, vertex=vertex,
             job=dispatch['job'], worker=dispatch['worker'], thread=thread, ready=ready,
             began=start, start=start, cpu=dispatch['cpu_time'],
-            holds_gil=dispatch['held_interpreter'],
-            inherited=np.where(dag < 0, dispatch['reference_deadline'], 0))
+            holds_gil=dispatch['held_interpreter'])
+        undeclared = dag < 0
+        if undeclared.any():
+            table['inherited'] = np.where(undeclared, dispatch['reference_deadline'], 0)
         self._dispatches.add(thread, dispatch.place, np.arange(before, len(self._executions)))
 
     def _owned(self, events: Batches) -> tuple[Ints, Ints]:
@@ -304,10 +321,11 @@ class ExecutionJoin:
             rest[mine] &= ~np.repeat(every, until - begins)
         more = np.flatnonzero(rest)[sort_by(event[rest])]
         first = len(self._executions)
-        self._executions.more(
-            len(more), dag=dag[more], vertex=vertex[more], job=job[more], **{
-                name: complete[field][event[more]] for name, field in (
-                    ('callback',) * 2, ('thread', 'vtid'), ('end', 'completed'))})
+        if len(more):
+            self._executions.more(
+                len(more), dag=dag[more], vertex=vertex[more], job=job[more], **{
+                    name: complete[field][event[more]] for name, field in (
+                        ('callback',) * 2, ('thread', 'vtid'), ('end', 'completed'))})
         row = np.append(row, np.arange(first, first + len(more)))
         # fill in the columns about completions, in the order of the file
         which = np.append(last_leg, more)

@@ -250,6 +250,7 @@ class _Source:
                 parts.setdefault(event[0], []).append((_one_row(event), np.array([place])))
             else:
                 self._others.append((place, event))
+        self._executions.expect(batch.share)
         self._executions.add(parts)
         for name, found in parts.items():
             if name not in PARTS:

@@ -47,10 +47,12 @@ class Batch(NamedTuple):
 
     :ivar tables: those that numpy can decode.
     :ivar others: the others, with their positions in the order of the file.
+    :ivar share: the part of the file up to the end of the batch, 0 to 1.
     """
 
     tables: Sequence[Table]
     others: Sequence[tuple[int, Event]]
+    share: float
 
     @property
     def n_events(self) -> int:

@@ -50,7 +50,7 @@ from mddag_executor.trace.events import Batch, Event, Ints, rows_at, Table, with
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
-_BATCH_BYTES = 1 << 21
+_BATCH_BYTES = 1 << 22
 _HEAD = np.dtype([('opcode', 'u1'), ('length', '<u8'), ('channel', '<u2')])
 """The begin of a message's record; its times follow after four bytes."""
 _TIMES_AT, _TIMES = 15, np.dtype([('log_time', '<u8'), ('publish_time', '<u8')])
@@ -131,11 +131,12 @@ class Reading:
         self.messages = 0           # in used chunks, of all channels
         self._packed = 0            # bytes of the used chunks, packed
         self.damage: Damage | None = None
-        self._path, self._channels = path, channels
+        self._path, self._channels, self._size = path, channels, size
         self._blocks = blocks(stream, start, size)
         self._undecoded: Counter[str] = Counter()       # by topic and reason
         self._left_out: list[int] = []      # impossible times
         self._place = 0             # of the next batch in the order of the file
+        self._until = start         # in the file, of the blocks that were read last
         self._buffer = bytearray()  # of a batch
         #: The channels of which messages are wanted, of all known ones; None: all are wanted.
         self._wanted: tuple[set[int], set[int]] | None = None
@@ -265,6 +266,7 @@ class Reading:
         places: list[tuple[Ints, Ints, Any]] = [(none, none, none.astype(np.uint16))]
         begins = np.append(0, np.cumsum([block.size for block in some], dtype=np.int64))
         data = memoryview(self._buffer)[:size]
+        self._until = some[-1].offset + some[-1].packed
         damage = None
         try:
             at, lengths, channels, defect = self._located(data, some, begins)
@@ -412,7 +414,7 @@ class Reading:
                 if event is not None:
                     others.append((self._place + start, event))
         others.sort(key=itemgetter(0))
-        return Batch(tables, others)
+        return Batch(tables, others, self._until / self._size)
 
     def _any(self, channel: int, message: bytes) -> Event | None:
         """Return the event in a message record; None, and count it, if it cannot be decoded."""

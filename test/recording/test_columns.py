@@ -64,3 +64,17 @@ def test_a_growing_table_has_all_rows(sizes):
     whole = concatenate(parts)
     assert isinstance(whole, Table) and growing.table().dtype == KIND
     assert growing.table().tolist() == whole.tolist()
+
+
+def test_rows_that_were_expected_are_added_without_a_copy():
+    growing = Growing(KIND, vertex=-1)
+    growing.expect(0.05)
+    first = growing.more(2000, job=np.arange(2000))
+    for _ in range(19):
+        growing.more(2000, job=1)
+    assert np.shares_memory(first['job'], growing.rows()['job'])
+    growing.more(100_000, job=2)    # more than expected
+    table = growing.table()
+    assert not np.shares_memory(first['job'], table['job'])
+    assert table['job'].tolist() == [*range(2000), *[1] * 38_000, *[2] * 100_000]
+    assert set(table['vertex'].tolist()) == {-1}
