@@ -330,8 +330,10 @@ def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):
     outcome = replay(path)
     assert outcome.warnings == []
     causes = outcome.explanation.summary()['sinks']['/a:starved']
-    assert causes['group'] > 10 and not causes['lost']
-    assert causes['released late'] < 5  # on a busy machine
+    assert causes['group'] > 1 and sum(causes.values()) > 10
+    # the others are those of a busy machine
+    assert {cause for cause, n in causes.items() if n} <= {
+        'group', 'released late', 'machine', 'interpreter'}
     assert [each.kind for each in outcome.drift()] == []
 
 

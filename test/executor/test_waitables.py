@@ -414,6 +414,12 @@ class Broken(Waitable):
     def __init__(self):
         super().__init__(ReentrantCallbackGroup())
 
+    def __enter__(self):    # Kilted's Waitable has none
+        pass
+
+    def __exit__(self, *error):
+        pass
+
     def is_ready(self, wait_set):
         raise ValueError('no device')
 
