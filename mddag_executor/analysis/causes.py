@@ -31,7 +31,8 @@ along its critical chain (see ``chains``):
   source), else *transport*, because the message was still on its way;
 * job that ended early because of a callback that never ran, or a sync that did not get all of its
   messages: *dropped* if the executor dropped the message from its queue, *destroyed* if it did so
-  because the node or subscription was destroyed; *waited* if the callback was ready; *not
+  because the node or subscription was destroyed, *withdrawn* if the program reset or cancelled
+  the timer; *waited* if the callback was ready; *not
   published* if the callback before it ended without publishing; else the message is *lost*.
 
 The largest part, beyond what is usual, is the cause of the miss.  Two rules precede:
@@ -59,11 +60,11 @@ from mddag_executor.recording.joins import as_of, distinct, equal_pairs
 import numpy as np
 
 CAUSES = ('waited', 'ran long', 'interpreter', 'group', 'released late', 'transport', 'machine',
-          'demoted', 'less important', 'dropped', 'destroyed', 'not published', 'lost', 'failed',
-          'other topic', 'never ended', 'program')
+          'demoted', 'less important', 'dropped', 'destroyed', 'withdrawn', 'not published',
+          'lost', 'failed', 'other topic', 'never ended', 'program')
 (WAITED, RAN_LONG, INTERPRETER, GROUP, RELEASED_LATE, TRANSPORT, MACHINE, DEMOTED, LESS_IMPORTANT,
- DROPPED, DESTROYED, NOT_PUBLISHED, LOST, FAILED, OTHER_TOPIC, NEVER_ENDED, PROGRAM, RAN_USUALLY,
- UNKNOWN, SKIPPED) = range(20)
+ DROPPED, DESTROYED, WITHDRAWN, NOT_PUBLISHED, LOST, FAILED, OTHER_TOPIC, NEVER_ENDED, PROGRAM,
+ RAN_USUALLY, UNKNOWN, SKIPPED) = range(21)
 #: Kinds of time of a job; the last three are not causes.
 PARTS = (*CAUSES, 'ran', 'unknown', 'skipped')
 #: By cause what to do about it.
@@ -85,6 +86,8 @@ REMEDIES = {
                '`keep: newest`); a late release of a timer is dropped when its next one is '
                'ready: less load, or a longer deadline',
     'destroyed': 'keep the node and its subscription until the job has ended',
+    'withdrawn': 'nothing, if the program meant it: it reset or cancelled the timer while its '
+                 'callback waited; else a longer period, or shorter callbacks before it',
     'not published': 'publish in each execution of the callback before it, or declare the topic '
                      'under `may_publish`',
     'lost': 'reliable QoS, the same QoS of publisher and subscription, or a longer queue (QoS '
@@ -98,9 +101,9 @@ ON_WORKERS = (WAITED, DEMOTED, LESS_IMPORTANT, DROPPED)
 """Causes for which a callback waited until a worker was free."""
 WAITS = (*ON_WORKERS, INTERPRETER, GROUP, NEVER_ENDED, PROGRAM)
 """Causes for which a callback waited for others, which are named."""
-DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED, 'withdrawn': DROPPED}
+DROPS = {'qos_depth': DROPPED, 'newer': DROPPED, 'destroyed': DESTROYED, 'withdrawn': WITHDRAWN}
 """By reason of a drop its cause; jobs are aborted because of an earlier miss: they *waited*."""
-NO_MESSAGE = (DROPPED, DESTROYED, NOT_PUBLISHED, LOST)
+NO_MESSAGE = (DROPPED, DESTROYED, WITHDRAWN, NOT_PUBLISHED, LOST)
 """Causes for which a callback never ran."""
 HANGS_NS = 1_000_000_000
 _NOTHING_NS = 1_000_000
@@ -214,7 +217,8 @@ class Never(NamedTuple):
     What is known of executions that never ran.
 
     :ivar dropped: dropped executions, a table of ``DROPPED_RUNS``.
-    :ivar dropped_at: by vertex when executions were dropped whose jobs are not recorded.
+    :ivar dropped_at: by vertex when executions were dropped whose jobs are not recorded, and the
+        causes of the misses that follow.
     :ivar started: executions that were started, a table of ``STARTED``.
     :ivar unpublished: by miss whether the callback before did not publish the message.
     :ivar knows_waiting: whether the executions that waited at the end are recorded: each process
@@ -222,7 +226,7 @@ class Never(NamedTuple):
     """
 
     dropped: Table
-    dropped_at: dict[int, Ints]
+    dropped_at: dict[int, tuple[Ints, Ints]]
     started: Table
     unpublished: Mask
     knows_waiting: bool
@@ -238,10 +242,10 @@ class Never(NamedTuple):
     def causes(self, miss: Ints, vertex: Ints, job: Ints, begin: Ints, end: Ints) -> Ints:
         """Return why vertices of jobs of misses never ran, which did not wait at the end."""
         lost = np.full(len(miss), LOST)
-        for each, times in self.dropped_at.items():
+        for each, (times, causes) in self.dropped_at.items():
             mine = np.flatnonzero(vertex == each)
             first, last = (np.searchsorted(times, time[mine]) for time in (begin, end))
-            lost[mine[last > first]] = DROPPED
+            lost[mine[last > first]] = causes[first[last > first]]
         drop = self.drops_of(vertex, job)
         return np.where(drop >= 0, np.append(self.dropped['cause'], UNKNOWN)[drop], np.where(
             self.unpublished[miss], NOT_PUBLISHED, lost))

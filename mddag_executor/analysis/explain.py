@@ -288,19 +288,21 @@ class Explanation:
                 found[first + v] = int(runs[first + v]) + max(after, default=0)
         return np.array([found.get(v, 0) for v in range(len(runs))])
 
-    def _dropped(self) -> tuple[Table, dict[int, Ints]]:
-        """Return the dropped executions; and by vertex when some without a job were dropped."""
+    def _dropped(self) -> tuple[Table, dict[int, tuple[Ints, Ints]]]:
+        """Return the dropped executions; and those without a job by vertex (``dropped_at``)."""
         drops, reasons = self._recording.drops, self._recording.names.drop_reasons
         place = np.array([*self._task_set.places_of_vertices(), -1])
-        without = drops[(drops['job'] < 0) & (drops['vertex'] >= 0)]
-        of = place[without['vertex']]
         causes, aborted = (np.array(each or [0])[drops['reason']] for each in (
             [DROPS.get(reason, WAITED) for reason in reasons],
             [reason == 'aborted' for reason in reasons]))
+        without = np.flatnonzero((drops['job'] < 0) & (drops['vertex'] >= 0))
+        without = without[sort_by(drops['time'][without])]
+        of = place[drops['vertex'][without]]
         return rows(DROPPED_RUNS, len(drops), cause=causes, aborted=aborted, **{
             name: drops[name] for name in ('vertex', 'job', 'time')}), {
-            vertex: np.sort(without['time'][of == place[vertex]])
-            for vertex in np.flatnonzero(np.isin(place[:-1], of)).tolist()}
+            vertex: (drops['time'][mine], causes[mine])
+            for vertex in np.flatnonzero(np.isin(place[:-1], of)).tolist()
+            for mine in [without[of == place[vertex]]]}
 
     def _unpublished(self, missed: Table) -> Mask:
         """

@@ -386,6 +386,34 @@ def test_a_callback_that_never_ran_has_the_cause_that_is_recorded(
     assert REMEDIES[cause] in text
 
 
+def test_a_timer_that_was_reset_while_it_waited_is_withdrawn(tmp_path, call):
+    """Nothing of messages or queues explains or mends that."""
+    text = """\
+mddag: 1
+nodes:
+  - node: /dog
+    callbacks: [{name: bark, timer: 50ms, sporadic: true, deadline: 20ms}]
+"""
+    trace = Written(tmp_path / 'run.mcap', text, 1)
+    for job in range(20):
+        at = job * 50
+        trace.release(0, job, at)
+        if job % 2:
+            trace.run(0, 0, job, at, at + 1)
+            continue
+        trace.add('drop', at + 10, 1000, 0, 0, job, 'withdrawn')
+        trace.add('expire', at + 10, 0, job)
+    path = trace.end(1000)
+    result = explained(path)
+    assert result['causes']['withdrawn'] == result['missed'] == 10
+    part = result['jobs'][0]['parts'][-1]
+    assert (part['vertex'], part['cause'], part['behind'], part['topics']) == (
+        '/dog:bark', 'withdrawn', [], [])
+    lines = call('explain', path).stdout.splitlines()
+    line = next(each for each in lines if REMEDIES['withdrawn'] in each)
+    assert 'QoS' not in line and '10 misses: 10 withdrawn' in lines
+
+
 @pytest.mark.parametrize(('importance', 'second'), [
     ('high', 'less important'), ('normal', 'demoted')])
 def test_lateness_is_told_from_importance(importance, second, tmp_path):

@@ -375,14 +375,16 @@ def test_a_damaged_ready_time_affects_its_execution_only(ready, run):
     assert (sink['completed'], sink['late']) == (5, ready < 0)
 
 
-def test_a_job_that_is_open_at_the_end_is_judged_by_that(run):
+@pytest.mark.parametrize(('reason', 'cause'), [
+    ('qos_depth', 'dropped'), ('destroyed', 'destroyed')])
+def test_a_job_that_is_open_at_the_end_is_judged_by_that(run, reason, cause):
     run.runs(GRAB, 0, 2, 1)
-    run.add('drop', 3, RUN, -1, -1, -1, 'qos_depth')
+    run.add('drop', 3, RUN, -1, -1, -1, reason)
     result = run.result(80)
     sink = of_camera(result)
     assert (sink['completed'], sink['late'], sink['overdue']) == (0, 1, 1)
-    assert result['dropped'] == {'qos_depth': 1}
-    assert result['misses']['causes']['dropped'] == 1
+    assert result['dropped'] == {reason: 1}
+    assert result['misses']['causes'][cause] == 1
 
 
 class Counted(list):
