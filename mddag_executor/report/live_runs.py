@@ -103,7 +103,7 @@ def _next_step(path: str, callbacks: dict[str, Any]) -> str:
     if any(each['kind'] in _DECLARED_KINDS for each in callbacks.values()):
         return (f'to judge it: mddag graph from-trace {path} --accept -o graph.yaml, then '
                 f'mddag replay {path} graph.yaml')
-    return ('there is nothing to judge: the nodes have no timer, subscription or service, and '
+    return ('there is nothing to judge: no timer, subscription or service of the nodes ran, and '
             'actions and parameters cannot be declared')
 
 

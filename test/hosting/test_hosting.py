@@ -133,6 +133,11 @@ def test_a_run_ends_with_its_last_program(world, mddag):
     assert (done.returncode, done.stdout, done.stderr) == (0, 'typed w\n', '')
     done = mddag('run', '--node', 'chat:never_spins', '--trace', 'typed.mcap')
     assert 'there is nothing to judge: ' in done.stdout and 'from-trace' not in done.stdout
+    # a node may have what could be declared
+    done = mddag('run', '--node', 'chat:hears_nothing', '--trace', 'heard.mcap')
+    assert done.stdout.splitlines()[-1] == (
+        'there is nothing to judge: no timer, subscription or service of the nodes ran, and '
+        'actions and parameters cannot be declared')
 
 
 def test_a_node_of_a_library_stays_as_long_as_a_program_uses_it(world, mddag):

@@ -464,6 +464,14 @@ def never_spins():
     print('typed w')
 
 
+def hears_nothing():
+    rclpy.init()
+    node = Node('deaf')
+    node.create_subscription(String, 'nobody_says_this', lambda message: None, 10)
+    rclpy.spin_once(node, timeout_sec=0.2)
+    rclpy.shutdown()
+
+
 def destroys_a_node():
     rclpy.init()
     executor, ran = SingleThreadedExecutor(), []
