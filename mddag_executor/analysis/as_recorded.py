@@ -21,7 +21,8 @@ from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import ReplayError
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import TABLES
-from mddag_executor.sources.open import Given, open_recording, Progress
+from mddag_executor.sources.open import Given, open_recording
+from mddag_executor.sources.progress import Progress
 from mddag_executor.text import counted
 from msg_graph import Dag, TaskSet
 from msg_graph.drift import Drift

@@ -34,7 +34,6 @@ Theory of operation
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 import os
 from typing import NamedTuple
@@ -48,6 +47,7 @@ from mddag_executor.recording.names import Callback, KINDS
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
 from mddag_executor.sources.open import open_to_draft, Traces
+from mddag_executor.sources.progress import Progress
 from msg_graph import Callback as Declared
 from msg_graph import EMPTY_TASK_SET, ExecutionTime, TaskSet
 from msg_graph.binding import function_of, is_background, is_side_output, OF_RATE
@@ -112,7 +112,7 @@ class System:
 
     def __init__(
         self, path: str | os.PathLike[str] | Traces, name: str | None = None,
-        progress: Callable[[int], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self.name = name or str(path)
         recording = open_to_draft(path, self.name, progress)

@@ -208,7 +208,7 @@ def _send(
             work.starter.claim(state.topic, msg))
         if claim is not None and claim.pool is running.pool:
             running.publishes(publisher, state, msg, claim.work)
-            return _send_noted(original, publisher, msg, state, engine, topic, claim.origin)
+            return _send_counted(original, publisher, msg, state, engine, topic, claim.origin)
         running.publishes(publisher, state, msg)
         if work is None or work.entity.callback is None:
             _note_outside(
@@ -217,40 +217,35 @@ def _send(
         original(publisher, msg)
         return None
     if topic is None:
-        _send_counted(original, publisher, msg, state)
-        return None
+        return _send_counted(original, publisher, msg, state)
     if work is not None and work.entity.awaiting is not None:
         engine.answers.note_published(work, state.topic, msg)
         origin = work.origin or work.answers
-    return _send_noted(
-        original, publisher, msg, state, engine, topic, origin or NO_ORIGIN)
+    return _send_counted(original, publisher, msg, state, engine, topic, origin or NO_ORIGIN)
 
 
-def _send_noted(
-    original: Any, publisher: Any, msg: Any, state: PublisherState, engine: Any, topic: Topic,
-    origin: Origin,
-) -> Publication:
-    """Publish on a trigger topic; return the publication."""
+def _send_counted(
+    original: Any, publisher: Any, msg: Any, state: PublisherState, engine: Any = None,
+    topic: Topic | None = None, origin: Origin = NO_ORIGIN,
+) -> Publication | None:
+    """
+    Publish with a publisher of which the messages are counted.
+
+    :param engine: notes the publication on a trigger topic; None: it is not noted.
+    :return: the publication, if it was noted.
+    """
     with state.lock:
         state.count += 1
-        state.is_tracked = True
         try:
+            if engine is None:
+                original(publisher, msg)
+                return None
+            state.is_tracked = True
             publication: Publication = engine.attribution.publish(
                 original, publisher, msg, state, topic, origin)
             return publication
         except BaseException:
             state.count -= 1  # the middleware has not counted it
-            raise
-
-
-def _send_counted(original: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
-    """Publish a message that belongs to no job with a publisher of which messages are counted."""
-    with state.lock:
-        state.count += 1
-        try:
-            original(publisher, msg)
-        except BaseException:
-            state.count -= 1
             raise
 
 
@@ -284,7 +279,7 @@ def _send_outside(
         return None, None
     claim.work.entity.publishes.add(state.topic)
     engine = claim.pool.engine
-    return _send_noted(
+    return _send_counted(
         original, publisher, msg, state, engine, engine.attribution.topics[state.topic],
         claim.origin), claim.pool
 

@@ -9,12 +9,12 @@ the tracers.  Other events are tuples.
 
 from __future__ import annotations
 
-from collections.abc import Callable as Function
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from mddag_executor.recording.columns import Ints, rows, Table
 from mddag_executor.recording.joins import different, sort_by
+from mddag_executor.sources.progress import Progress
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.errors import TraceError
@@ -156,7 +156,7 @@ class Listener(Protocol):
 
 def read_events(
     reader: TraceReader, kinds: Mapping[str, tuple[Any, ...]], others: Sequence[str],
-    progress: Function[[int], None] | None = None, listener: Listener | None = None,
+    progress: Progress | None = None, listener: Listener | None = None,
 ) -> Events:
     """
     Return the events of a trace: those of ``kinds`` as a table, and ``others`` as tuples.

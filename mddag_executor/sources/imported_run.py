@@ -26,7 +26,6 @@ Executions are linked with messages (``links``), and assigned to jobs (``importe
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable as Function
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import re
@@ -55,6 +54,7 @@ from mddag_executor.sources.imported_events import (
 )
 from mddag_executor.sources.imported_jobs import ImportedJobs, SKIPPED
 from mddag_executor.sources.links import Links, Oddities
+from mddag_executor.sources.progress import Progress
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.events import Event
@@ -99,7 +99,7 @@ class ImportedRun:
 
     def __init__(
         self, reader: TraceReader, name: str, task_set: TaskSet | None, head: Head | None = None,
-        progress: Function[[int], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self._reader = reader
         self.name = name
@@ -131,7 +131,7 @@ class ImportedRun:
         self._odd = Oddities(self.odd, 5)
         self._fallbacks: Counter[str] = Counter()
 
-    def _read(self, progress: Function[[int], None] | None) -> Events:
+    def _read(self, progress: Progress | None) -> Events:
         """Return the events."""
         with named_errors(self._reader.path, self.name):
             return read_events(self._reader, self.kinds, self.others, progress)

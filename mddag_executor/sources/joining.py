@@ -30,7 +30,7 @@ Each trace becomes a recording; their tables are merged in the order of time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 import os
 from typing import Any
@@ -51,6 +51,7 @@ from mddag_executor.sources.executions import Numbering
 from mddag_executor.sources.head import declared, no_run, read_head
 from mddag_executor.sources.joined_jobs import JoinedJobs, Released
 from mddag_executor.sources.own import begin_of, end_losses, Read, read_process
+from mddag_executor.sources.progress import Progress, progress_from
 from mddag_executor.text import counted, listed
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.numbers import Numbers
@@ -71,12 +72,6 @@ _HAPPENED = {
     'drops': 'time', 'demotions': 'time', 'stops': 'end'}
 
 Event = tuple[Any, ...]
-Progress = Callable[[int], None]
-
-
-def progress_from(progress: Progress | None, before: int) -> Progress | None:
-    """Return what is called with the number of events read of one recording of several."""
-    return None if progress is None else lambda more: progress(before + more)
 
 
 def label_of(path: str) -> str:
@@ -294,7 +289,7 @@ class Joined:
                     f'{self._parts[0].name}: '
                     + clocks.said(known.get(machine), ways.get((0, machine)), parts[0].label))))
 
-    def recording(self, progress: Callable[[int], None] | None = None) -> Recording:
+    def recording(self, progress: Progress | None = None) -> Recording:
         """
         Return the recording of the whole run.
 

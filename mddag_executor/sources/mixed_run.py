@@ -33,7 +33,6 @@ of executions is (``declared_events``).
 
 from __future__ import annotations
 
-from collections.abc import Callable as Function
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -59,7 +58,8 @@ from mddag_executor.sources.imported_events import (
     START,
 )
 from mddag_executor.sources.imported_run import hosts_in, ImportedRun, OFF_THE_GRID
-from mddag_executor.sources.joining import label_of, progress_from
+from mddag_executor.sources.joining import label_of
+from mddag_executor.sources.progress import Progress, progress_from
 from mddag_executor.sources.undeclared_run import CLOCK_STEP, UndeclaredRun
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
@@ -112,7 +112,7 @@ class _Recording:
         """Return whether this executor recorded it."""
         return self.head is not None
 
-    def read(self, progress: Function[[int], None] | None) -> Events:
+    def read(self, progress: Progress | None) -> Events:
         """Return its events, by its own clock and numbers; note from when until when it judges."""
         with named_errors(self.path, self.path):
             events = self._read_own(progress) if self.is_own else read_events(
@@ -133,7 +133,7 @@ class _Recording:
                           if event[0].name == CLOCK_STEP and isinstance(event[4], int)]
         return events
 
-    def _read_own(self, progress: Function[[int], None] | None) -> Events:
+    def _read_own(self, progress: Progress | None) -> Events:
         assert self.head is not None
         others = (*UndeclaredRun.others, HOST, _JUDGE_FROM)
         jobs = DeclaredEvents(declared(self.head, self.path)) if is_declared(self.head) else None
@@ -170,7 +170,7 @@ class MixedRun(UndeclaredRun):
 
     def __init__(
         self, paths: Sequence[str], task_set: TaskSet | None,
-        progress: Function[[int], None] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self._parts = [_Recording(path) for path in paths]
         imported = [part for part in self._parts if not part.is_own]
@@ -213,7 +213,7 @@ class MixedRun(UndeclaredRun):
 
     # --- events ----------------------------------------------------------------------------------
 
-    def _read(self, progress: Function[[int], None] | None) -> Events:
+    def _read(self, progress: Progress | None) -> Events:
         several: list[Events] = []
         count = 0
         for part in self._parts:

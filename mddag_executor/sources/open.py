@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 import os
 
@@ -14,10 +14,9 @@ from mddag_executor.recording.mapping import judged_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.sources.head import named_errors, read_head, without_declaration
 from mddag_executor.sources.own import read_own
+from mddag_executor.sources.progress import Progress
 from mddag_executor.trace import TraceReader
 from msg_graph import EMPTY_TASK_SET, load, TaskSet
-
-Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,7 @@ from mddag_executor.sources.head import (
     steps,
     TASK_SET,
 )
+from mddag_executor.sources.progress import Progress
 from mddag_executor.text import counted
 from mddag_executor.trace import TraceReader
 from mddag_executor.trace.events import Batch, Event
@@ -104,7 +105,6 @@ _CORE = (_RELEASE, _DEADLINE, *_JOB_ENDS)
 
 _VERTEX = re.compile('[0-9]{1,9}')
 
-Progress = Callable[[int], None]
 
 
 def read_own(

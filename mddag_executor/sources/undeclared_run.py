@@ -36,7 +36,6 @@ the causes of executions.  Differences:
 
 from __future__ import annotations
 
-from collections.abc import Callable as Function
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -63,6 +62,7 @@ from mddag_executor.sources.imported_events import (
 from mddag_executor.sources.imported_jobs import ImportedJobs, SKIPPED
 from mddag_executor.sources.imported_run import ImportedRun, OFF_THE_GRID
 from mddag_executor.sources.links import Links
+from mddag_executor.sources.progress import Progress
 from mddag_executor.sources.stamps import find_stamps, Sent
 from mddag_executor.trace.times import NEVER
 import numpy as np
@@ -204,7 +204,7 @@ class UndeclaredRun(ImportedRun):
         'release', 'of undeclared timers skipped, as the one before began later than they were '
         'due')}
 
-    def _read(self, progress: Function[[int], None] | None) -> Events:
+    def _read(self, progress: Progress | None) -> Events:
         events = super()._read(progress)
         return events._replace(own=frozenset([
             *(pid for pid, _ in events.threads), *(event[2] for event in events.others)]))

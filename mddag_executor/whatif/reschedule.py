@@ -30,7 +30,8 @@ from mddag_executor.simulate.execution_times import with_execution_times
 from mddag_executor.simulate.policies import ALL_POLICIES, preempts, ROS2
 from mddag_executor.simulate.run import check
 from mddag_executor.simulate.workload import SKIPPED
-from mddag_executor.sources.open import Given, open_recording, Progress, undeclared
+from mddag_executor.sources.open import Given, open_recording, undeclared
+from mddag_executor.sources.progress import Progress
 from mddag_executor.text import counted, listed
 from mddag_executor.whatif.computed import ComputedRun
 from mddag_executor.whatif.load import LoadBuilder, RecordedLoad
