@@ -1,7 +1,7 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Joins the traces of several processes into the recording of one run.
+Joins the traces of several processes of a declared run into one recording.
 
 Theory of operation
 -------------------
@@ -38,7 +38,7 @@ from typing import Any
 from mddag_executor.core import NEVER
 from mddag_executor.errors import UsageError
 from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
-from mddag_executor.recording.head import Head, is_declared, ReplayError
+from mddag_executor.recording.head import Head, ReplayError
 from mddag_executor.recording.joins import different, RowNumbers, sort_by
 from mddag_executor.recording.losses import Loss, Losses
 from mddag_executor.recording.recorded_jobs import Jobs
@@ -104,10 +104,6 @@ class _Part:
         head = read_head(self.reader)
         if head is None:
             raise no_run(self.reader)
-        if not is_declared(head):
-            raise ReplayError(
-                path, 'it was recorded without a declaration, so its jobs have no names that '
-                'other traces know', 'replay it by itself, with a GRAPH')
         self.head: Head = head
         self.shift = self.last = 0
         self.label = label_of(path)

@@ -1,7 +1,9 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-A run of which this executor ran some processes, and recorded them, and LTTng recorded others.
+A run of several recordings that declared jobs do not join: undeclared or imported ones.
+
+This executor ran and recorded some of the processes, or all of them, and LTTng recorded others.
 
 Theory of operation
 -------------------
@@ -16,7 +18,8 @@ of executions is (``declared_events``).
    has recorded none, a warning names each topic whose messages are not found.
 2. *Clocks.*  Times are those of the steady clock of the computer plus an offset, which LTTng and
    this executor read when they begin.  If both have recorded it, and the boot of the computer is
-   the same, times of this executor are converted exactly to those of LTTng.  The clocks of other
+   the same, times of this executor are converted exactly to those of LTTng or, without LTTng, of
+   the first trace.  The clocks of other
    computers are compared by messages (``imported_clocks``).  Source timestamps are of the system
    clock, so they are compared with recorded times before these are converted.
 3. *Twice.*  If LTTng has also recorded a process of this executor, its events are left out: those
@@ -43,7 +46,7 @@ from mddag_executor.recording.head import Head, is_declared, ReplayError
 from mddag_executor.recording.joins import distinct, sort_by
 from mddag_executor.recording.losses import Loss
 from mddag_executor.recording.recording import Recording
-from mddag_executor.recording.tables import FAILED, JOB_ENDS, NOTHING
+from mddag_executor.recording.tables import FAILED, JOB_ENDS, NOTHING, UNKNOWN
 from mddag_executor.sources.declared_events import DeclaredEvents
 from mddag_executor.sources.entities import full_name
 from mddag_executor.sources.head import damage, declared, named_errors, no_run, read_head, steps
@@ -118,6 +121,9 @@ class _Recording:
             events = self._read_own(progress) if self.is_own else read_events(
                 self.reader, KINDS, ImportedRun.others, progress)
         table = events.table
+        if self.is_own and not len(table):
+            raise ReplayError(self.path, 'there is nothing in it but its beginning',
+                              'leave it out, or record the process again')
         if not len(table) or not self.is_own and any(
                 event[0].name.startswith('mddag:') and event[0].name != HOST
                 for event in events.others):
@@ -157,12 +163,12 @@ class _Recording:
 
 class MixedRun(UndeclaredRun):
     """
-    A run of processes of this executor and of others; ``read`` turns it into tables.
+    A run of processes of this executor, and perhaps of others; ``read`` turns it into tables.
 
-    :param paths: the traces of this executor's processes, and one imported recording.
+    :param paths: the traces of this executor's processes, and at most one imported recording.
     :param task_set: the declaration to judge by; None: the recorded one, if any.
     :raises mddag_executor.trace.TraceError: if a trace cannot be read.
-    :raises ReplayError: if there is not one imported recording, or if traces were recorded with
+    :raises ReplayError: if there are several imported recordings, or if traces were recorded with
         several declarations, and none is given.
     """
 
@@ -186,12 +192,16 @@ class MixedRun(UndeclaredRun):
         self._failed: Ints = np.empty(0, dtype=np.int64)
         super().__init__(
             self._parts[0].reader, ', '.join(paths), self._judge(task_set), None, progress)
-        if self._other_run is not None and not self._joined_executions.any():
+        if self._other_run is not None and not self._joins_recordings():
             raise self._other_run
         heads = [part.head for part in self._parts if part.head is not None]
         self.head = self.head._replace(
             default_deadline=heads[0].default_deadline,
             file='' if task_set is not None else next((each.file for each in heads), ''))
+        if len(heads) == len(self._parts):
+            self.head = self.head._replace(
+                policy=heads[0].policy,
+                workers=max(self.head.workers, sum(each.workers for each in heads)))
 
     def _judge(self, given: TaskSet | None) -> TaskSet | None:
         """Return the declaration to judge by."""
@@ -220,8 +230,25 @@ class MixedRun(UndeclaredRun):
             several.append(part.read(progress_from(progress, count)))
             count += part.reader.message_count or 0
         several = self._convert_clocks(self._without_duplicates(several))
+        self._check_processes(several)
         self._check_run(several)
         return self._merge(several)
+
+    def _check_processes(self, several: Sequence[Events]) -> None:
+        """Refuse traces of one process that have the same nodes, as two copies of one have."""
+        seen: dict[tuple[str, int, str], str] = {}
+        for part, events in zip(self._parts, several):
+            if not part.is_own:
+                continue
+            clocks = part.clocks(events)
+            found = [(clocks[pid].boot if pid in clocks else '', pid, node)
+                     for pid, nodes in _nodes(events).items() for node in sorted(nodes)]
+            for each in found:
+                if each in seen:
+                    raise ReplayError(
+                        part.path, f'it is of the same process as {seen[each]}: both have the '
+                        f'node {each[2]}', 'give the trace of each process once')
+            seen.update(dict.fromkeys(found, part.path))
 
     def _check_run(self, several: Sequence[Events]) -> None:
         """
@@ -247,6 +274,8 @@ class MixedRun(UndeclaredRun):
 
     def _without_duplicates(self, several: list[Events]) -> list[Events]:
         """Leave out what is recorded twice (rule 3)."""
+        if self._parts[0].is_own:
+            return several
         imported, clocks = several[0], self._parts[0].clocks(several[0])
         table, threads = imported.table, np.array([pid for pid, _ in imported.threads])
         of = threads[table['thread']]
@@ -278,7 +307,7 @@ class MixedRun(UndeclaredRun):
             *several[1:]]
 
     def _convert_clocks(self, several: list[Events]) -> list[Events]:
-        """Convert times of this executor to those of LTTng's recording (rule 2)."""
+        """Convert times of this executor to those of the first recording (rule 2)."""
         known: dict[str, int] = {}
         found = []
         for part, events in zip(self._parts, several):
@@ -303,6 +332,7 @@ class MixedRun(UndeclaredRun):
         """Return all events as those of one recording, with different ids of processes."""
         processes, tids = Numbers(), Numbers()
         threads: list[tuple[int, int]] = []
+        recording_of: list[int] = []
         tables, others, names = [], list[Event](), dict[tuple[int, int], str]()
         own, shift = set[int](), dict[int, int]()
         failed, place = [self._failed], 0
@@ -317,6 +347,7 @@ class MixedRun(UndeclaredRun):
                 failed.append(part.failed + place)
             place = int(table['place'].max(initial=place)) + 1
             threads += new
+            recording_of += [number] * len(new)
             tables.append(table)
             for layout, time, pid, tid, *values in events.others:
                 if part.is_own and layout.name in (_CARET_INIT, _JUDGE_FROM, CLOCK_STEP):
@@ -338,6 +369,8 @@ class MixedRun(UndeclaredRun):
         nowhere = 0, 0
         if nowhere not in threads:      # gaps are of no thread
             threads.append(nowhere)
+            recording_of.append(UNKNOWN)
+        self._recording_of = np.array(recording_of, dtype=np.int64)
         table = concatenate([*tables, self._gaps(tables, threads.index(nowhere))])
         return Events(
             table[sort_by(table['time'], table['place'])], threads,
@@ -411,9 +444,15 @@ class MixedRun(UndeclaredRun):
                 f'{self.name}: {topic} is not joined: {counted(received, "execution")} for '
                 f'messages that {sent}'))
 
+    def _joins_recordings(self) -> bool:
+        """Return whether a message of one recording started an execution of another one."""
+        runs = self.links.runs[self.links.runs['message'] >= 0]
+        sent = self._events.table['thread'][self.links.messages['at'][runs['message']]]
+        return bool((self._recording_of[sent] != self._recording_of[runs['thread']]).any())
+
     @property
     def _joined_executions(self) -> Mask:
-        """Return which executions were started by a message of the other recording."""
+        """Return which executions of one executor were started by a message of another one."""
         links = self.links
         sender = links.is_own[self._events.table['thread'][links.messages['at']]]
         crossed: Mask = (links.runs['message'] >= 0) & (
@@ -421,7 +460,7 @@ class MixedRun(UndeclaredRun):
         return crossed
 
     def _missing_topics(self) -> Iterator[tuple[str, str, int]]:
-        """Yield topics of which no message was found in the other recording, and why not."""
+        """Yield topics of which no message was found in the imported recording, and why not."""
         runs, messages, links, crossed = (
             self.links.runs, self.links.messages, self.links, self._joined_executions)
         topics = {number: topic for topic, number in links.topics.items()}

@@ -22,7 +22,7 @@ from msg_graph import EMPTY_TASK_SET, load, TaskSet
 @dataclass(frozen=True)
 class Traces:
     """
-    The traces of the processes of one run.
+    The traces of the processes of one run, with or without a declaration.
 
     One of them may be an imported recording, of the processes that other executors ran.
 
@@ -99,12 +99,13 @@ def _of_several(
             raise ReplayError(
                 path, 'it is an ordinary bag, which has no executions to join with those of '
                 'traces', 'give the traces of the processes of one run')
-    if all(read_head(TraceReader(path)) is not None for path in paths):
+    heads = [read_head(TraceReader(path)) for path in paths]
+    if all(head is not None and is_declared(head) for head in heads):
         from mddag_executor.sources.joining import Joined
         return judged_by(Joined(paths, traces.offsets).recording(progress), task_set)
     if traces.offsets:
-        raise UsageError('--offset: with an imported recording clocks of computers are compared '
-                         'by messages: leave the option out')
+        raise UsageError('--offset: unless each trace is of a declared run, clocks of computers '
+                         'are compared by messages: leave the option out')
     from mddag_executor.sources.mixed_run import MixedRun
     return MixedRun(paths, task_set, progress).read()
 
