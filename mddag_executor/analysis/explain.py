@@ -85,12 +85,12 @@ class Explanation:
         self._executions = recording.executions[:None if len(judged.missed) else 0]
         self._rows = ran(self._executions)
         run = recording.run
-        # of each process
-        if run.imported:
-            self._workers = max(run.own_processes.values(), default=0)
-        else:
-            self._workers = 0 if run.head.policy in SIMULATED_ONLY else (
-                run.head.workers if run.processes == 1 else run.workers_each)
+        # by process; of others it is not known which threads share their work
+        self._workers = run.own_processes
+        if not (run.imported or self._workers):
+            self._workers = {0: run.head.workers}
+        if not run.imported and run.head.policy in SIMULATED_ONLY:
+            self._workers = {}
         # whether what waited at the end is recorded
         self._knows_waiting = run.imported or run.shut_down and run.processes == 1
         # where callbacks may delay each other: of another executor it is not known which threads
@@ -163,9 +163,9 @@ class Explanation:
         } if imported else None
         hangs, blocked = self._hangs()
         return Pool(
-            {place: self._busy(rows[self._place[rows] == place], hangs)
+            {place: self._busy(rows[self._place[rows] == place], place, hangs)
              for place in places - of_threads},
-            [stop for stop in self.stops if stop[1] >= first], self._workers > 0,
+            [stop for stop in self.stops if stop[1] >= first], any(self._workers.values()),
             self._place, of_vertex, threads, hangs, blocked, self._busy_programs(),
             self._answers())
 
@@ -196,15 +196,16 @@ class Explanation:
                 for vertex, number in self._by_vertex(self._who.programs).items()
                 if number in spans}
 
-    def _busy(self, rows: Ints, hangs: Mask) -> Busy:
+    def _busy(self, rows: Ints, place: int, hangs: Mask) -> Busy:
         """Return when executions occupied all workers, and when they may have held the GIL."""
+        process = _FIRST_PROCESS - place if self._recording.run.imported else place
         table = self._executions
         on_workers = rows[table['worker'][rows] >= 0]
         start, end = table['start'][on_workers], table['end'][on_workers]
         holding = rows[self._may_hold(rows, hangs)]
         since, until = table['began'][holding], table['end'][holding]
         return Busy(
-            Spans(*crowded(start, end, max(1, self._workers))),
+            Spans(*crowded(start, end, max(1, self._workers.get(process, 1)))),
             Spans(*(crowded(since, until, 1) if len(holding) else crowded(start, end, 1))),
             Spans(*crowded(since, until, 2)))
 

@@ -65,6 +65,21 @@ def workers(text: str) -> int:
                    f'an integer from 1 to {MOST_WORKERS}')(text)
 
 
+def workers_of(text: str) -> int | dict[str, int]:
+    """Return a number of workers, or by process its number of workers."""
+    if '=' not in text:
+        return workers(text)
+    found: dict[str, int] = {}
+    for part in text.split(','):
+        name, _, number = part.rpartition('=')
+        if not name or name in found:
+            raise argparse.ArgumentTypeError(
+                f'{text!r} is not PROCESS=N,… with a number for each process, such as '
+                'control=2,perception=4')
+        found[name] = workers(number)
+    return found
+
+
 positive_int = _number(int, lambda value: value >= 1, 'an integer from 1 up')
 not_negative_int = _number(int, lambda value: value >= 0, 'an integer from 0 up')
 seed = _number(int, lambda value: 0 <= value < 2 ** 64, 'an integer from 0 to 2**64 - 1')

@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='run the scheduler over the recorded releases and execution times')
     group = parser.add_argument_group('with --reschedule')
     add = group.add_argument
-    options.add(group, '--workers', only='in each process, ', otherwise='as recorded')
+    options.add(
+        group, '--workers', only='in each process, ', otherwise='as recorded',
+        type=options.workers_of, metavar='N|PROCESS=N,…')
     options.add(group, '--cpus', otherwise='as recorded, else enough for all')
     add('--processes', metavar='N|FILE', type=options.Input,
         help='run the nodes in N processes, packed by the recorded times, or in those of '

@@ -42,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, "a recorded run, an MCAP file ('-': standard input), or a declaration alone, a "
         'YAML file')
     options.add(parser, '--workers', only='in each process, ',
-                otherwise="as recorded, or the declaration's")
+                otherwise="as recorded, or the declaration's", type=options.workers_of,
+                metavar='N|PROCESS=N,…')
     options.add(parser, '--cpus', otherwise='as recorded, or enough for all')
     options.add(parser, '--policy', otherwise='as recorded, or rad')
     options.add(parser, '--preemptive', otherwise='as recorded')
@@ -120,6 +121,9 @@ def _of_graph(
     if args.begin:
         raise UsageError('--from: a simulation needs no warm-up: leave the option out')
     task_set = common.load_graph(args.trace)
+    if isinstance(args.workers, dict):
+        raise UsageError('--workers: a declaration is simulated in one process: give a number '
+                         'alone')
     workers = defaults.workers(args.workers, task_set)
     args.seed = args.seed or 0
     times = simulate.execution_times(args, task_set, workers)

@@ -24,8 +24,7 @@ class Run:
     :ivar recorded_set: the recorded DAG tasks.
     :ivar declared: whether the recording contains a declaration.
     :ivar imported: whether another executor ran it, or some of its processes.
-    :ivar own_processes: of an imported run the processes that this executor ran, each with its
-        number of workers.
+    :ivar own_processes: the processes that this executor ran, each with its number of workers.
     :ivar same: whether the run itself was judged by ``task_set``.
     :ivar start: the first release, or when the first execution became ready, ns; None: neither.
     :ivar end: the end of the run, ns; ``shut_down``: whether it is recorded.
@@ -36,7 +35,7 @@ class Run:
     :ivar judged_releases: range of judged releases, ns; None: all.
     :ivar hosted: changes of the vertices of a DAG that the process runs, by position in the order.
     :ivar notices_stops: from this time on stops are recorded, ns; None: they are not.
-    :ivar processes: number of processes, each with ``workers_each`` workers.
+    :ivar processes: number of processes; ``workers_each``: their largest number of workers.
     :ivar placed: nodes of each process; empty: one process.
     :ivar links: whether ``message`` is the publication that started an execution; otherwise the
         job links them.

@@ -163,5 +163,5 @@ def _fixed(task_set: TaskSet, times: list[list[int]]) -> Durations:
 
 def _recorded(run: Recording, task_set: TaskSet) -> Durations:
     tables = Tables.build(task_set, max_active_jobs=NEVER)
-    builder = LoadBuilder(run, tables, run.run.head.workers)
+    builder = LoadBuilder(run, tables, (run.run.head.workers,))
     return Durations(tables, builder.build().load, run.jobs)

@@ -450,6 +450,13 @@ class ProcessNodes(TypedDict):
     """Names of its nodes."""
 
 
+class ProcessPool(ProcessNodes):
+    """A process, its nodes and its workers."""
+
+    workers: int
+    """Its number of workers."""
+
+
 class PathsResult(TypedDict, total=False):
     """Paths of a computed run, if its declaration requires something of them."""
 
@@ -464,7 +471,7 @@ class RescheduleResultRare(TypedDict, total=False):
 
     cpus: int
     """Number of CPUs, if `--cpus` or the recording limits them."""
-    processes: list[ProcessNodes]
+    processes: list[ProcessPool]
     """The processes, if there are several."""
     skipped_jobs: int
     """Releases that the timer skipped in the recording, if any: they are skipped again."""

@@ -73,10 +73,13 @@ from mddag_executor.simulate.workload import needs_python, SKIPPED, Workload
 
 
 class EngineOptions(NamedTuple):
-    """How to run a load, as integers: see ``schedule.Settings``."""
+    """
+    How to run a load, as integers: see ``schedule.Settings``.
 
-    workers: int
-    processes: int
+    :ivar workers: by process its number of workers.
+    """
+
+    workers: list[int]
     preemptive: int
     polling: int
     urgency: int
@@ -168,10 +171,13 @@ def _fill(
 ) -> None:
     """Fill the columns of an empty state, and of deliveries and machine if the load needs them."""
     sends = len(load.delay_base) > 0
-    fill_state(t, s, o.workers * o.processes, 2 if sends else 1, o.urgency)
+    n_workers = 0
+    for i in range(len(o.workers)):
+        n_workers += o.workers[i]
+    fill_state(t, s, n_workers, 2 if sends else 1, o.urgency)
     fill_pool(t, s, p, o.preemptive, o.polling, o.dispatch_overhead, o.switch_overhead)
-    if o.processes > 1:
-        divide(t, s, p, o.processes, o.workers)
+    if len(o.workers) > 1:
+        divide(t, s, p, o.workers)
     s.scalars[JUDGE_FROM], s.scalars[JUDGE_UNTIL] = o.judge_from, o.judge_until
     if sends:
         d.scalars.append(0)

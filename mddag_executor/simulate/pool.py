@@ -76,13 +76,14 @@ def fill_pool(
             p.first_order.append(NEVER)
 
 
-def divide(t: Tables, s: State, p: Pool, processes: int, workers: int) -> None:
-    """Divide the workers among several processes with an interpreter each."""
-    for process in range(1, processes + 1):
+def divide(t: Tables, s: State, p: Pool, workers: list[int]) -> None:
+    """Divide the workers among several processes with an interpreter and a pool each."""
+    for i in range(len(workers)):
+        process = i + 1
         if process > 1:
-            add_process(s, workers)
-        s.n_workers[process] = workers
-        for _ in range(workers):
+            add_process(s, workers[i])
+        s.n_workers[process] = workers[i]
+        for _ in range(workers[i]):
             p.process.append(process)
     for vertex in range(t.n_vertices + 1):
         s.process[vertex] = t.process[vertex]

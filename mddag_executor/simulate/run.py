@@ -83,9 +83,9 @@ def simulate(
 
 def check(settings: Settings) -> None:
     """Check settings."""
-    if not 1 <= settings.workers <= MOST_WORKERS:
-        raise UsageError(
-            f'workers: {settings.workers} is out of range: give 1 to {MOST_WORKERS}')
+    for workers in settings.workers_of:
+        if not 1 <= workers <= MOST_WORKERS:
+            raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
     if settings.duration_ns < 1:
         raise UsageError(f'duration: {settings.duration_ns} ns is too short: give at least 1')
     if settings.cpus is not None and settings.cpus < 1:

@@ -40,7 +40,7 @@ class Settings:
     """
     How a load is scheduled.
 
-    :ivar workers: of each process.
+    :ivar workers: of each process; ``pools``: by process its number of workers, if these differ.
     :ivar duration_ns: when the run ends, on the load's clock.
     :ivar preemptive: None: the policy's own mode of the paper's experiment.
     :ivar judge: ``horizon`` judges open jobs at the end, ``completions`` (as in the paper) only
@@ -67,17 +67,23 @@ class Settings:
     judge_until: int = NEVER
     processes: int = 1
     on_late: str = 'continue'
+    pools: tuple[int, ...] = ()
+
+    @property
+    def workers_of(self) -> tuple[int, ...]:
+        """Return by process its number of workers."""
+        return self.pools or (self.workers,) * self.processes
 
     @property
     def preempts(self) -> bool:
         """Return whether a more urgent execution preempts a running one."""
-        return preempts(self.policy, self.preemptive, self.processes)
+        return preempts(self.policy, self.preemptive, len(self.workers_of))
 
     @property
     def engine_options(self) -> EngineOptions:
         """Return the settings as integers for the engine; raise like ``preempts``."""
         return EngineOptions(
-            self.workers, self.processes, int(self.preempts),
+            list(self.workers_of), int(self.preempts),
             int(self.policy == ROS2), find_policy(self.policy).urgency,
             self.dispatch_overhead_ns,
             self.switch_overhead_ns, self.judge_from, self.judge_until, self.cpus or NEVER,

@@ -311,6 +311,7 @@ class Joined:
             self.name, head, self.task_set, self.task_set, same=False,
             processes=len(self._parts), placed=self._placed(),
             workers_each=max(part.head.workers for part in self._parts),
+            own_processes={part.place: part.head.workers for part in self._parts},
             hosted=[(int(ranks[place][order]), dag, vertices)
                     for place, order, dag, vertices in hosted]), tables['executions'])
         run = replace(run, start=begin_of(tables['releases'], tables['executions']))

@@ -27,23 +27,22 @@ import numpy as np
 
 
 def dispatch_times(
-    n_workers: int, worker: Ints, group: Ints, ready: Ints, start: Ints, end: Ints,
-    processes: Iterable[Ints], holding: Mask,
+    worker: Ints, group: Ints, ready: Ints, start: Ints, end: Ints,
+    processes: Iterable[tuple[int, Ints]], holding: Mask,
 ) -> Ints:
     """
     Return the dispatch times of executions, ns.
 
     All are given by columns, in the order of their ends; times in ns.
 
-    :param n_workers: number of workers of each process.
     :param worker: the worker of each execution, -1: unknown.
     :param group: number of its mutually exclusive callback group, or -1.
-    :param processes: the executions of each process.
+    :param processes: of each process its number of workers, and its executions.
     :param holding: whether it holds the GIL.
     """
     free = np.maximum(ready, _end_before(group, end))
     could = np.maximum(free, _end_before(worker, end))
-    for mine in processes:
+    for n_workers, mine in processes:
         waiting = mine[free[mine] < could[mine]]
         n_free, n_ended = (np.searchsorted(np.sort(times[mine]), free[waiting], 'right')
                            for times in (free, end))

@@ -49,7 +49,7 @@ from mddag_executor.analysis.spans import crowded, Spans
 from mddag_executor.analysis.usage import ran
 from mddag_executor.core import legs_of, NEVER, quantile, Tables
 from mddag_executor.recording import tables as recorded_tables
-from mddag_executor.recording.columns import Ints
+from mddag_executor.recording.columns import Ints, Mask
 from mddag_executor.recording.joins import as_of, distinct, sort_by
 from mddag_executor.recording.recording import Recording
 from mddag_executor.simulate import Workload
@@ -108,14 +108,14 @@ class LoadBuilder:
     """
     Makes a load from a recording.
 
-    :param n_workers: number of workers of each recorded process.
+    :param workers: by recorded process its number of workers.
     :param processes: by vertex the recorded process, from 1; None: one process.
     :param times: by DAG the execution times of its jobs and vertices, for a recording without
         executions; None: missing ones are estimated.
     """
 
     def __init__(
-        self, recording: Recording, tables: Tables, n_workers: int,
+        self, recording: Recording, tables: Tables, workers: Sequence[int],
         processes: Sequence[int] | None = None, times: Sequence[Any] | None = None,
     ) -> None:
         task_set = recording.task_set
@@ -124,6 +124,7 @@ class LoadBuilder:
         #: Number of runs of undeclared callbacks in other processes than the first.
         self.left_out = 0
         self._process = [*(processes or [1] * tables.n_vertices), 1]
+        self._workers = workers
         self._times = times
         self._timer = [d.vertices[d.source].callback.kind == 'timer' for d in task_set.dags]
         # by global vertex and leg: the edge (number in its DAG) that its message satisfies
@@ -172,7 +173,7 @@ class LoadBuilder:
         places = recording.job_places
         #: By execution the row of its job.
         self._row = np.where(places >= 0, places - jobs.first[table['dag']], _UNKNOWN)
-        self._note_pieces(n_workers)
+        self._note_pieces()
         self._note_completions()
         self._note_publications()
         del self._row, self._executions
@@ -205,7 +206,7 @@ class LoadBuilder:
             skipped[skipped] = noticed[row[skipped]] == mine['time'][skipped]
             self._skipped |= {(dag, each) for each in row[skipped].tolist()}
 
-    def _note_pieces(self, n_workers: int) -> None:
+    def _note_pieces(self) -> None:
         """Find the dispatch times of pieces; keep undeclared pieces."""
         table = self._executions
         rows = ran(table)
@@ -235,8 +236,8 @@ class LoadBuilder:
         known = first[source] & (turn >= 0)
         ready[source[known]] = turn[known]
         self._dispatch_ns = dispatch_times(
-            n_workers, worker, self._groups(rows, vertex), ready, start, end,
-            [mine for _, mine in members],
+            worker, self._groups(rows, vertex), ready, start, end,
+            [(self._workers[number - 1], mine) for number, mine in members],
             holds & (cpu >= 0) & (completes == recorded_tables.VERTEX))
         ran_as = np.full(self._tables.n_vertices + 1, _UNKNOWN)
         ran_as[vertex[::-1]] = rows[::-1]     # the first one is written last
@@ -373,20 +374,25 @@ class LoadBuilder:
                 for dag in self._task_set.dags]
 
     def build(
-        self, overheads: bool = True, process: Sequence[int] | None = None, workers: int = NEVER,
+        self, overheads: bool = True, process: Sequence[int] | None = None,
+        workers: Sequence[int] | None = None,
     ) -> RecordedLoad:
         """
         Return the load.
 
-        :param process: by vertex the process to run it in; None: as recorded.
-        :param workers: workers of each process, if fewer than in the recording.
+        :param process: by vertex the process to run it in, from 1; None: as recorded.
+        :param workers: by such a process its number of workers; None: as recorded.
         """
         process = process or self._process
+        # by vertex: whether it has the only worker of its process, which had several
+        only_one = np.array([
+            workers is not None and workers[new - 1] == 1 < self._workers[old - 1]
+            for old, new in zip(self._process, process)], dtype=np.bool_)
         ran = len(self._recording.executions) > 0
         every, usual, late = self._dispatches()
         if not overheads:
             late = late[:0].copy()
-        self._subtract_others(workers == 1 or max(process) < max(self._process))
+        self._subtract_others(only_one | (max(process) < max(self._process)))
         unsent, delays, transport = self._unsent(), None, None
         if ran:
             delays, transport = self._transports(overheads, process)
@@ -417,7 +423,7 @@ class LoadBuilder:
         if others[:, 3].any():
             columns |= self._inherited(others[:, 0], others[:, 3])
         del took, cpu, held
-        load = self._load(costs, others[:, 0], overheads, workers == 1)
+        load = self._load(costs, others[:, 0], overheads, only_one)
         return RecordedLoad(
             load._replace(fates=self._fates(len(costs)), **columns),
             self._numbers, demand, executions, estimated, unknown, usual, transport, late)
@@ -513,32 +519,37 @@ class LoadBuilder:
         every = np.append(self._dispatch_ns, usual or 0)     # number -1
         return every, usual, every[number]
 
-    def _subtract_others(self, alone: bool) -> None:
+    def _subtract_others(self, alone: Mask) -> None:
         """
         Subtract from durations the time in which others computed, down to the CPU time.
 
-        :param alone: whether executions that hold the GIL take their CPU time.
+        :param alone: by vertex whether executions that hold the GIL take their CPU time.
         """
         took, cpu, held, start, end = (
             self._columns[name] for name in ('took', 'cpu', 'held', 'start', 'end'))
         known = cpu >= 0
-        computes = known & np.where(held > 0, alone, 2 * cpu >= took)
+        computes = known & np.where(
+            held > 0, self._of_vertices(alone) if alone.any() else False, 2 * cpu >= took)
         np.minimum(took, cpu, out=took, where=computes)
         holds = np.flatnonzero(known & (held > 0))
-        process = np.concatenate([np.empty(0, dtype=np.int64), *(
-            np.tile(self._process[first:after], len(jobs))
-            for first, after, jobs in zip(self._first, self._first[1:], self._numbers))])[holds]
+        process = self._of_vertices(np.array(self._process, dtype=np.int16))[holds]
         for number in distinct(process).tolist():
             mine = holds[process == number]
             shared = Spans(*crowded(start[mine], end[mine], 2)).within(start[mine], end[mine])
             took[mine] = np.maximum(np.minimum(took[mine], cpu[mine]), took[mine] - shared)
 
-    def _load(self, costs: Any, others: Ints, overheads: bool, one_worker: bool) -> Workload:
+    def _of_vertices(self, values: Any) -> Any:
+        """Return values by vertex as those of each vertex of each job."""
+        return np.concatenate([values[:0], *(
+            np.tile(values[first:after], len(jobs))
+            for first, after, jobs in zip(self._first, self._first[1:], self._numbers))])
+
+    def _load(self, costs: Any, others: Ints, overheads: bool, only_one: Mask) -> Workload:
         n_dags, times = len(self._numbers), list[Any]()
         for dag in range(n_dags):
             release, noticed, turn, busy = self._of(dag, 'release', 'noticed', 'turn', 'busy')
             times.append(release if self._timer[dag] and not overheads else np.where(
-                (turn >= 0) | one_worker & (busy > 0), release, noticed))
+                (turn >= 0) | only_one[self._tables.source[dag]] & (busy > 0), release, noticed))
         ready = np.concatenate([*times, others])
         times.clear()
         order = sort_by(ready)      # equal ones stay in the order of DAGs and jobs

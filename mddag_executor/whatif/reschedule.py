@@ -10,19 +10,20 @@ transport.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any, TYPE_CHECKING
 
-from mddag_executor import defaults
 from mddag_executor.analysis.as_recorded import recording_result, Replay
 from mddag_executor.analysis.usage import share
 from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, processes_of, Tables, Tally
 from mddag_executor.core.tables import DEMOTE, ON_LATE
+from mddag_executor.errors import UsageError
 from mddag_executor.memory import give_back
 from mddag_executor.recording.columns import Table
 from mddag_executor.recording.head import Head, ReplayError
+from mddag_executor.recording.joins import different, distinct
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import Columns, UNKNOWN
 from mddag_executor.simulate import LogEntry, schedule, Settings
@@ -38,6 +39,7 @@ from mddag_executor.whatif.load import LoadBuilder, RecordedLoad
 from msg_graph import EMPTY_TASK_SET, Process, TaskSet
 from msg_graph.derive import gc_paused
 from msg_graph.model import MOST_WORKERS
+import numpy as np
 
 if TYPE_CHECKING:
     from mddag_executor.results.replays import (
@@ -69,7 +71,7 @@ class Reschedule:
         self.task_set, self._run, self.notes = run.task_set, run, run.run.notes
         self.work, self.tables, self.settings = work, tables, settings
         self.recorded, self.processes, self.warnings = recorded, processes, warnings
-        self.workers = settings.workers * settings.processes
+        self.workers = sum(settings.workers_of)
         self._skip, self._overheads = skip, overheads
         self.tally = Tally(run.task_set, tables)
         result = schedule(tables, work.load, settings)
@@ -84,8 +86,8 @@ class Reschedule:
     @property
     def worker_names(self) -> list[str]:
         """Return the names of workers, if they are more than a number."""
-        return [f'{process.name} {w}' for process in self.processes
-                for w in range(self.settings.workers)]
+        return [f'{process.name} {w}' for process, workers in zip(
+            self.processes, self.settings.workers_of) for w in range(workers)]
 
     @property
     def _requires(self) -> bool:
@@ -143,7 +145,8 @@ class Reschedule:
             cpus['cpus'] = settings.cpus
         if self.processes:
             processes['processes'] = [
-                {'name': each.name, 'nodes': list(each.nodes)} for each in self.processes]
+                {'name': each.name, 'nodes': list(each.nodes), 'workers': workers}
+                for each, workers in zip(self.processes, settings.workers_of)]
         if skipped := work.load.fates.count(SKIPPED):
             skips['skipped_jobs'] = skipped
         if self.notes:
@@ -183,7 +186,7 @@ def reschedule(
     task_set: TaskSet | None = None,
     *,
     policy: str | None = None,
-    workers: int | None = None,
+    workers: int | Mapping[str, int] | None = None,
     preemptive: bool | None = None,
     on_late: str | None = None,
     overheads: bool = True,
@@ -201,7 +204,8 @@ def reschedule(
     :param path: a trace of this executor, a recording, or a function that reads one.
     :param task_set: the declaration to schedule by; None: the one in the trace.
     :param policy: a row of ``mddag_executor.simulate.ALL_POLICIES``; None: as recorded.
-    :param workers: size of the pool of each process; None: as recorded.
+    :param workers: size of the pool of each process, or by the name of a process that of this
+        one; otherwise as recorded: of callbacks of several recorded processes the largest one.
     :param preemptive: whether a smaller key preempts a larger one; None: as recorded, if the
         policy supports it.
     :param on_late: handling of late jobs of a DAG that does not declare it; None: as recorded.
@@ -223,14 +227,14 @@ def reschedule(
     """
     if policy is not None:
         preempts(policy, preemptive or False)
-    check(Settings(workers=defaults.WORKERS if workers is None else workers, cpus=cpus,
-                   dispatch_overhead_ns=dispatch_overhead))
+    given_pools = (workers,) if isinstance(workers, int) else tuple((workers or {}).values())
+    check(Settings(pools=given_pools, cpus=cpus, dispatch_overhead_ns=dispatch_overhead))
     run = path if isinstance(path, Recording) else path() if callable(path) else open_recording(
         path, task_set, name, progress)
     if run.task_set is EMPTY_TASK_SET:
         raise undeclared(run.name, run.run.imported)
-    head, each, given = run.run.head, run.run.workers_each, policy
-    policy, workers = _settings(head._replace(workers=each), run.name, policy, workers)
+    head, given = run.run.head, policy
+    policy = _policy(head, run.name, policy)
     if cpus is None:
         cpus = head.cpus if head.cpus > 0 else None
     if preemptive is None:
@@ -244,8 +248,9 @@ def reschedule(
     tables = tables_of(run.task_set)
     recorded = Replay(run, skip) if run.run.messages is None else None
     with gc_paused():
-        builder = LoadBuilder(run, tables, each, _processes(run, run.run.placed),
-                              None if times is None else times(run))
+        builder = LoadBuilder(
+            run, tables, recorded_workers(run, run.run.placed), _processes(run, run.run.placed),
+            None if times is None else times(run))
     give_back()
     placed = _placed(run, builder) if processes is None else processes(
         run.task_set, builder.times())
@@ -254,6 +259,7 @@ def reschedule(
     if DEMOTE in tables.on_late:  # by measured times, as the executor does
         tables = tables_of(with_execution_times(run.task_set, builder.times()))
     tables = tables._replace(process=[*_processes(run, placed), 1])
+    pools = _pools(run, placed, workers)
     notes = []
     if given is None and len(placed) > 1 and policy == ROS2:
         notes.append(
@@ -262,7 +268,7 @@ def reschedule(
         policy = 'fifo'
     preempts(policy, preemptive, len(placed))
     with gc_paused():
-        work = builder.build(overheads, tables.process, workers if workers < each else NEVER)
+        work = builder.build(overheads, tables.process, pools)
     if work.unknown:
         raise ReplayError(
             run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
@@ -294,9 +300,9 @@ def reschedule(
             f'{run.name}: the time in which coroutines waited is left out: '
             + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
     settings = Settings(
-        policy, workers, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
+        policy, max(pools), run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
         judge_from=max(begin, judge_from), judge_until=judge_until,
-        processes=max(1, len(placed)), on_late=on_late)
+        processes=len(pools), on_late=on_late, pools=pools if len(set(pools)) > 1 else ())
     with gc_paused():
         return Reschedule(
             run, work, tables, settings, warnings, skip, overheads, placed, recorded)
@@ -320,23 +326,60 @@ def _placed(run: Recording, builder: LoadBuilder) -> Sequence[Process]:
     return declared if len(ran) == 1 or not run.run.same else ()
 
 
-def _settings(
-    head: Head, name: str, policy: str | None, workers: int | None
-) -> tuple[str, int]:
-    """Return policy and workers as requested, otherwise as recorded."""
+def recorded_workers(run: Recording, placed: Sequence[Process]) -> tuple[int, ...]:
+    """
+    Return the workers of each process, at least of one.
+
+    They are those of the recorded process in which its callbacks ran, or of the largest of them.
+    """
+    if len(placed) < 2:
+        return (run.run.workers_each,)
+    table = run.executions
+    table = table[table['worker'] >= 0]
+    recorded, which = different(table['process'])
+    own = run.run.own_processes
+    counts = [own.get(number) or len(distinct(table['worker'][which == place]))
+              for place, number in enumerate(recorded.tolist())]
+    of_vertex = np.array([*_processes(run, placed), 0], dtype=np.int64)[table['vertex']]
+    found = []
+    for number in range(1, len(placed) + 1):
+        mine = distinct(which[of_vertex == number]).tolist()
+        found.append(max((counts[each] for each in mine), default=run.run.workers_each))
+    return tuple(found)
+
+
+def _pools(
+    run: Recording, placed: Sequence[Process], given: int | Mapping[str, int] | None
+) -> tuple[int, ...]:
+    """Return the workers of each process as requested, otherwise as recorded."""
+    if isinstance(given, int):
+        return (given,) * max(1, len(placed))
+    names = [process.name for process in placed]
+    for name in given or ():
+        if not names:
+            raise UsageError(f'--workers: {name}: there is one process: give a number alone')
+        if name not in names:
+            raise UsageError(f'--workers: there is no process {name}: name one of {listed(names)}')
+    recorded = recorded_workers(run, placed)
+    if given:
+        recorded = tuple(given.get(name, n) for name, n in zip(names, recorded))
+    for workers in recorded:
+        if not 1 <= workers <= MOST_WORKERS:
+            raise ReplayError(
+                run.name, f'it says that it was recorded with {counted(workers, "worker")}',
+                'give --workers')
+    return recorded
+
+
+def _policy(head: Head, name: str, policy: str | None) -> str:
+    """Return the policy as requested, otherwise as recorded."""
     if policy is None:
         policy = head.policy
         if policy not in ALL_POLICIES:
             raise ReplayError(
                 name, f"it was recorded with policy '{policy}', which this version does not have",
                 f'give --policy, one of {", ".join(ALL_POLICIES)}')
-    if workers is None:
-        workers = head.workers
-        if not 1 <= workers <= MOST_WORKERS:
-            raise ReplayError(
-                name, f'it says that it was recorded with {counted(workers, "worker")}',
-                'give --workers')
-    return policy, workers
+    return policy
 
 
 def with_groups(

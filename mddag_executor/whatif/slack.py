@@ -280,7 +280,11 @@ class Search:
         return None
 
     def fewer(self, of: str) -> Fewer | None:
-        """Return the minimum of ``workers`` or ``cpus`` that misses nothing; None: unknown."""
+        """
+        Return the minimum of ``workers`` or ``cpus`` that misses nothing; None: unknown.
+
+        If processes have different numbers of workers, it is the largest of them.
+        """
         problem = self._problem
         given = getattr(problem.settings, of)
         if given is None or self.misses:
@@ -288,7 +292,9 @@ class Search:
         least, miss = given, None
         while least > 1 and miss is None:
             self._problem = problem._replace(settings=replace(
-                problem.settings, **{of: least - 1}))
+                problem.settings, **{of: least - 1}, pools=tuple(
+                    min(each, least - 1) if of == 'workers' else each
+                    for each in problem.settings.pools)))
             miss = self.miss(ALL, 1.0)
             if miss is None:
                 least -= 1

@@ -265,7 +265,7 @@ def test_a_recording_says_what_a_request_has_inherited(make_executor, make_node,
     deadline = int(recording.jobs.release[0]) + 30 * 10 ** 9
     assert table['inherited'][inherits].tolist() == [deadline]
     assert not inherits[table['vertex'] >= 0].any()
-    load = LoadBuilder(recording, Tables.build(recording.task_set), 1).build().load
+    load = LoadBuilder(recording, Tables.build(recording.task_set), (1,)).build().load
     inherited = [*map(int, load.inherited)]
     assert sorted(inherited)[:2] == [deadline, NEVER]
     assert load.inherits_from[inherited.index(deadline)] == 0

@@ -129,6 +129,9 @@ def test_machine_messages_and_processes(case, horizon, stop, seed):
     settings = replace(
         settings_of(case, horizon * SLOW, 'horizon', stop),
         processes=1 if one else chances.randint(1, 3), cpus=chances.choice([None, 1, 2, 3]))
+    if chances.random() < 0.5 and not one:
+        settings = replace(settings, pools=tuple(
+            chances.randint(1, 4) for _ in range(settings.processes)))
     tables = slowed(Tables.build(case.task_set), settings.processes, chances)
     load_ = with_everything(case.load(horizon), tables, chances)
     plain, found = (

@@ -40,7 +40,7 @@ class Job:
     end: int = -1
 
 
-def times(jobs, workers, cpus=None, python=False, preemptive=False, divided=False):
+def times(jobs, workers, cpus=None, python=False, preemptive=False, second=0):
     """Return when each job starts first, and when it ends."""
     task_set = declaration([
         single(f'd{n}', 10 ** 9, job.deadline) for n, job in enumerate(jobs)])
@@ -55,8 +55,9 @@ def times(jobs, workers, cpus=None, python=False, preemptive=False, divided=Fals
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine, 'needs_python', lambda load: python)
         log = schedule(
-            tables, load, Settings('rad', workers, 10 ** 12, preemptive, cpus=cpus,
-                                   processes=1 + divided), log=True, compiled=False).log
+            tables, load, Settings(
+                'rad', workers, 10 ** 12, preemptive, cpus=cpus,
+                pools=(workers, second) if second else ()), log=True, compiled=False).log
     found = [(-1, -1)] * n
     for now, kind, _, dag, _, _ in log:
         if kind == START and found[dag][0] < 0:
@@ -117,7 +118,7 @@ class Ticks:
     workers: int
     cpus: int
     python: bool
-    divided: bool
+    second: int     # workers of the second process, 0: there is one
     on: list[Job | None] = field(default_factory=list)
     waiting: list[Job] = field(default_factory=list)
     locks: dict[int, Lock] = field(default_factory=dict)
@@ -125,7 +126,7 @@ class Ticks:
     slice_left: int | None = None
 
     def times(self):
-        self.on = [None] * self.workers * (1 + self.divided)
+        self.on = [None] * (self.workers + self.second)
         now = 0
         while any(job.end < 0 for job in self.jobs):
             self._instant(now)
@@ -156,7 +157,7 @@ class Ticks:
         waiting = sorted(self.waiting, key=lambda j: j.release + j.deadline)
         for job in waiting:
             idle = [w for w, other in enumerate(self.on) if other is None and (
-                not self.divided or w // self.workers + 1 == job.interpreter)]
+                not self.second or 1 + (w >= self.workers) == job.interpreter)]
             if not idle:
                 continue
             first = next(each for each in waiting if each.interpreter == job.interpreter)
@@ -227,13 +228,13 @@ def some_jobs(draw):
 
 
 @examples(200)
-@given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans(), st.booleans())
-def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, divided):
+@given(some_jobs(), st.integers(1, 4), st.integers(1, 4), st.booleans(), st.integers(0, 3))
+def test_as_the_model_that_goes_by_ticks(jobs, workers, cpus, python, second):
     for job in jobs:  # processes with a pool of their own have an interpreter of their own
-        job.interpreter = job.interpreter if divided else 1
+        job.interpreter = job.interpreter if second else 1
     with pytest.MonkeyPatch.context() as patch:
         for name, ticks in (('SWITCH_NS', SWITCH), ('SLICE_NS', SLICE), ('TAIL_NS', TAIL)):
             patch.setattr(machine, name, ticks)
         patch.setattr(queues, 'TURN_NS', TURN)
-        found = times(jobs, workers, cpus, python, divided=divided)
-    assert found == Ticks(jobs, workers, cpus, python, divided).times()
+        found = times(jobs, workers, cpus, python, second=second)
+    assert found == Ticks(jobs, workers, cpus, python, second).times()

@@ -21,13 +21,13 @@ class Trace:
     """The trace of a process that runs one vertex; its clock is late by some ns."""
 
     def __init__(self, folder, name, vertex, late=0, graph=GRAPH, judges_from=0, dag=0, boot='',
-                 begin=0, pid=None):
+                 begin=0, pid=None, workers=2):
         self.path = str(folder / f'run.{name}.mcap')
         self.file = TraceFile(self.path, overwrite=True)
         self.vertex, self.late, self.job = vertex, late, 0
         self.pid = 100 + vertex + dag if pid is None else pid
         self.dag = dag
-        self.add('task_set', begin, graph, 'graph.yaml', 'rad', 2, 100 * MS, 64, False, 2)
+        self.add('task_set', begin, graph, 'graph.yaml', 'rad', workers, 100 * MS, 64, False, 2)
         self.add('caret_init', begin, BASE - late, 'jazzy')
         if boot:
             self.add('host', begin, f'computer of {name}', boot)

@@ -493,7 +493,8 @@ def test_each_recorded_process_has_a_pool_of_its_own(workers, three_processes):
     result = outcome.result()
     assert (result['policy'], result['workers']) == ('fifo', 2)
     assert result['processes'] == [
-        {'name': 'cam', 'nodes': ['/camera']}, {'name': 'det', 'nodes': ['/detect']}]
+        {'name': 'cam', 'nodes': ['/camera'], 'workers': 1},
+        {'name': 'det', 'nodes': ['/detect'], 'workers': 1}]
     sinks = result['dags']['/camera']['sinks']['/detect:detect'], replay(
         three_processes, graph).result()['dags']['/camera']['sinks']['/detect:detect']
     assert [(sink['completed'], sink['late']) for sink in sinks] == [(10, 7)] * 2

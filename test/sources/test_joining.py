@@ -225,6 +225,39 @@ def test_each_process_has_its_workers_and_interpreter_again(two, tmp_path, call)
     assert '9 late' in call('replay', *two, tmp_path / 'graph.yaml', '--reschedule').stdout
 
 
+def test_each_process_has_the_number_of_workers_that_it_had(tmp_path, call):
+    """Unless a number is given for it; of several that become one the largest counts."""
+    paths = []
+    for dag, (name, workers) in enumerate((('up', 1), ('down', 3))):
+        trace = Trace(tmp_path, name, 0, dag=dag, graph=TWO, workers=workers)
+        for i in range(9):
+            trace.runs_another(i * 12 * MS, i * 12 * MS + 6 * MS)
+            trace.runs(i * 12 * MS, i * 12 * MS + 6 * MS, 4 * MS, ready=i * 12 * MS)
+        paths.append(trace.end(120 * MS))
+    for given, expected in ((None, (1, 3)), (2, (2, 2)), ({'up': 2}, (2, 3)),
+                            ({'down': 1, 'up': 4}, (4, 1))):
+        outcome = reschedule(paths, workers=given)
+        assert outcome.settings.workers_of == expected
+        assert outcome.workers == sum(expected) == len(outcome.worker_names)
+        assert [each['workers'] for each in outcome.result()['processes']] == [*expected]
+    run = call('replay', *paths, '--reschedule', '--workers', 'down=2')
+    assert '3 workers in 2 processes' in run.stdout
+    one = tmp_path / 'one.yaml'
+    one.write_text('processes: {p: [/a, /b]}')
+    run = call('replay', *paths, '--reschedule', '--processes', one)
+    assert 'policy rad, 3 workers, ' in run.stdout
+    for given, says in (
+            ('other=2', '--workers: there is no process other: name one of up, down'),
+            ('up=0', "'0' is not an integer from 1 to 4096"),
+            ('up=1,up=2', "'up=1,up=2' is not PROCESS=N,…")):
+        assert says in call('replay', *paths, '--reschedule', '--workers', given).stderr
+    assert '--workers: up: there is one process: give a number alone' in call(
+        'replay', *paths, '--reschedule', '--processes', one, '--workers', 'up=1').stderr
+    # both callbacks waited for 6 ms for another one, on the only worker, or on one of three
+    causes = {each['sink']: each['cause'] for each in replay(paths).explanation.mostly()}
+    assert causes == {'/a:t': 'waited', '/b:t': 'interpreter'}
+
+
 def test_a_run_of_one_process_is_rescheduled_in_two(tmp_path, call):
     trace = Trace(tmp_path, 'whole', 0, graph=TWO)
     for i in range(9):

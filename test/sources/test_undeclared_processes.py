@@ -138,6 +138,7 @@ def test_a_draft_has_all_processes(tmp_path):
 def test_a_schedule_has_the_pool_of_each_process(tmp_path, graph):
     result = reschedule(three(tmp_path), graph).result()
     assert sorted(each['name'] for each in result['processes']) == ['camera', 'detect', 'plan']
+    assert [each['workers'] for each in result['processes']] == [2, 2, 2]
     assert result['policy'] == 'rad'
     assert (sink(result)['completed'], sink(result)['late']) == (N, 0)
 

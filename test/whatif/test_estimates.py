@@ -25,7 +25,7 @@ def late(n_workers, *executions, holding=()):
         np.array([-1 if each is None else each for each in column], dtype=np.int64)
         for column in zip(*executions))
     return dispatch_times(
-        n_workers, worker, group, ready, start, end, [np.arange(len(worker))],
+        worker, group, ready, start, end, [(n_workers, np.arange(len(worker)))],
         np.isin(np.arange(len(worker)), holding)).tolist()
 
 
