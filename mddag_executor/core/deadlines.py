@@ -11,6 +11,7 @@ next job, and is replaced when its time has come.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from heapq import heappop, heappush
 from itertools import pairwise
 
@@ -46,19 +47,29 @@ class Deadlines:
         # it is too early, and replaced then, if that sink is in another process
         self._add(slot, state.job_release[slot] + self._least[state.job_dag[slot]])
 
-    def judge(self, now: int) -> None:
-        """Decide ``SINK_OVERDUE`` for each sink whose deadline was before now."""
+    def judge(self, now: int, later: Container[int] = ()) -> None:
+        """
+        Decide ``SINK_OVERDUE`` for each sink whose deadline was before now.
+
+        :param later: the slots of jobs that are not judged yet.
+        """
         heap = self._heap
+        kept = []
         while heap and heap[0][0] < now:
             time, slot = heappop(heap)
             if self._entry.get(slot) != time:
                 continue  # an earlier one was added
+            if slot in later:
+                kept.append((time, slot))
+                continue
             del self._entry[slot]
             if self._state.job_state[slot] == OPEN:
                 judge_incomplete(
                     *self._rule, slot, SINK_OVERDUE, self._judged[slot], now - 1)
                 self._judged[slot] = now - 1
                 self._add(slot, next_deadline(*self._rule, slot, now - 1))
+        for entry in kept:
+            heappush(heap, entry)
         self.next = heap[0][0] if heap else NEVER
 
     def first(self) -> int:

@@ -33,6 +33,14 @@ LEAST_PATIENCE_NS = 2 * SHORT_CALLBACK_NS
 NET_NS = 20_000_000
 """While a short callback runs longer than expected, arrivals stay unnoticed for this at most."""
 
+REPORT_NS = 100_000
+"""
+The thread of a callback that has ended reports that within this, if it gets the lock and the GIL.
+
+The end of a result may be in time when it is reported after the deadline.  So its job is judged
+again after this.
+"""
+
 QUIET_NS = 5_000_000
 """
 If no thread had nothing to run for this long, one that rests cancels the next look.

@@ -32,6 +32,7 @@ from mddag_executor.executor.bounds import (
     LOOK_PART,
     NET_NS,
     QUIET_NS,
+    REPORT_NS,
     SHORT_CALLBACK_NS,
     SOON_NS,
     STOP_NS,
@@ -41,6 +42,7 @@ from mddag_executor.executor.holder_check import HolderCheck, Threads
 from mddag_executor.executor.loop import EventLoop, Parking
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.timers import TimerQueue
+from mddag_executor.executor.work import Work
 from mddag_executor.text import step_text
 from rclpy.logging import get_logger
 
@@ -61,6 +63,9 @@ class Clocked(Threads, Protocol):
 
     def waited_since(self, since: int) -> int:
         """Return since when a thread has waited for events."""
+
+    def reporting(self) -> list[Work]:
+        """Return the executions that do not run now, but may have ended."""
 
 
 class Call:
@@ -105,9 +110,19 @@ class Overdue:
             self._pool.agenda.set(self, at + 1, at + NET_NS)
 
     def come_due(self) -> None:
-        """Report what is overdue."""
+        """
+        Report what is overdue.
+
+        A callback may have ended in time, while its thread still waits for the lock to say so.
+        """
         self.deadline = NEVER
-        self._pool.engine.judge_overdue(self._pool.now)
+        pool = self._pool
+        pool.engine.judge_overdue(pool.now, pool.reporting())
+        deadline = self._deadlines.first()
+        if deadline < pool.now:
+            self.deadline = deadline
+            at = pool.now - pool.clock.offset_ns + REPORT_NS
+            pool.agenda.set(self, at, at + NET_NS)
 
 
 class DueTimes:

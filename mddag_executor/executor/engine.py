@@ -977,11 +977,17 @@ class Engine:
         if self.record is not None:
             self.record('clock_step', now, get_native_id(), step)
 
-    def judge_overdue(self, now: int) -> None:
-        """Report the sinks whose deadlines are over and which have not completed."""
+    def judge_overdue(self, now: int, reporting: Iterable[Work] = ()) -> None:
+        """
+        Report the sinks whose deadlines are over and which have not completed.
+
+        :param reporting: executions that have perhaps ended, and are reported in a moment: their
+            jobs are judged later.
+        """
         if self._finished:
             return
-        self.deadlines.judge(now)
+        several = [work.origin or work.answers for work in reporting]
+        self.deadlines.judge(now, [each.slot for each in several if each is not None])
         if self._state.decisions:
             self._decided(now)
 

@@ -91,6 +91,10 @@ class Pool(Protocol):
         """Note whether a thread must wait for an entity's messages or requests, at any time."""
 
 
+RUNS = object()
+"""The outcome of an execution that has begun, and whose callback has not returned."""
+
+
 class WorkerThread:
     """
     A thread that runs callbacks.
@@ -114,7 +118,7 @@ class WorkerThread:
     :ivar start: when its execution, or the one that has just ended, began, on the trace's clock.
     :ivar end: when it ended; 0: it runs.
     :ivar outcome: its exception, or the future that it waits for, if it goes on later; None: it
-        has finished.
+        has finished; ``RUNS``: it runs.
     """
 
     __slots__ = ('work', 'worker', 'permit', 'thread', 'vtid', 'ident', 'waits', 'published',
@@ -208,6 +212,7 @@ class WorkerThread:
         if habit.rests < 1 or pool.is_recorded:
             measurement = self.measurement = Measurement(habit)
         self.published = self.paused_ns = 0
+        self.outcome = RUNS
         if self.pause is not None:
             self.wait_for_pause()
         start = self.start = monotonic_ns() + pool.offset

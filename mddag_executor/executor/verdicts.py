@@ -39,8 +39,8 @@ class DeadlineMiss:
     A sink that missed its deadline; times in ns since the epoch.
 
     ``kind`` is ``overdue`` if it was not known to be complete after its deadline, which is
-    reported at once.  On a busy machine it may have ended in time, and its thread may report that
-    later: then the counts and the trace have it in time.  ``kind`` is ``late`` if the executor
+    reported at once, but not while the thread of a callback that has ended still has to report
+    that: it may have ended in time.  ``kind`` is ``late`` if the executor
     learnt of the completion first, at the time ``completed_ns`` (else None).  A miss that is
     certain before the deadline is ``expired`` or ``failed`` (a callback of the job raised) if the
     job can no longer complete, or ``dropped`` for a newer job (``keep: newest``).

@@ -65,7 +65,7 @@ from mddag_executor.executor.outside import Outside
 from mddag_executor.executor.pausing import can_pause, Pauses
 from mddag_executor.executor.shutdown import is_over
 from mddag_executor.executor.stamps import StampedReleases
-from mddag_executor.executor.threads import ThreadState, WorkerThread
+from mddag_executor.executor.threads import RUNS, ThreadState, WorkerThread
 from mddag_executor.executor.timers import Fired, TimerQueue
 from mddag_executor.executor.weakly import weakly
 from mddag_executor.executor.work import current, Destroyed, Refused, Work
@@ -731,6 +731,11 @@ class WorkerPool:
         """Return the thread that runs an execution."""
         return next(
             (each for each in self.threads() if each.work is work), None)
+
+    def reporting(self) -> list[Work]:
+        """Return the executions that do not run now, but have ended, or are about to begin."""
+        return [work for each in self.threads()
+                if (work := each.work) is not None and each.outcome is not RUNS]
 
     def running_threads(self) -> list[WorkerThread]:
         """Return the threads whose callbacks run with a worker."""

@@ -184,6 +184,9 @@ def test_a_sink_that_ended_in_time_is_in_time_also_if_it_was_reported_overdue(re
     timer = entity_of(engine, task_set, 0, 0)
     engine.timer_due(Work(timer, print), 0, 0)
     work = engine.step(0, 30 * MS).work
+    engine.judge_overdue(40 * MS + 1, [work])   # its thread may report that it has ended
+    check(engine)
+    assert not misses and engine.deadlines.first() == 40 * MS
     engine.judge_overdue(40 * MS + 1)
     check(engine)
     sink = engine.verdicts.tally.result()['dags']['/motor']['sinks']['/motor:drive']

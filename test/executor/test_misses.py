@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from mddag_executor import replay
 from mddag_executor.core.tally import total
 from mddag_executor.executor import misses
+from mddag_executor.executor.threads import RUNS
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -26,6 +27,7 @@ from std_srvs.srv import Empty
 
 from .conftest import matched, Spinning, wait_for
 from .declared import Declared, graph
+from .inside import pool_of
 
 SECONDS = float(os.environ.get('MISS_STRESS_SECONDS', 0))
 PERIODS_MS = (3, 5, 7)
@@ -154,6 +156,40 @@ def test_a_result_that_never_comes_is_a_miss_at_its_deadline(make_executor, make
         assert wait_for(lambda: misses)
     assert [(miss.kind, miss.vertex, miss.completed_ns) for miss in misses] == [
         ('overdue', '/sink:end', None)]
+
+
+@pytest.mark.parametrize('has_ended', [False, True])
+def test_a_callback_that_has_ended_is_no_miss_before_its_thread_could_say_so(
+        make_executor, make_node, has_ended):
+    """Another thread owns the executor's lock when it ends, and still after the deadline."""
+    text = ONCE.replace('20ms', '100s')
+    misses, began, may_end = [], threading.Event(), threading.Event()
+
+    def end():
+        began.set()
+        may_end.wait(60.0)
+
+    nodes = Declared(make_node, text, {'end': end})
+    start = make_node('other').create_publisher(Header, '/start', 10)
+    executor = make_executor(
+        loads(text), on_deadline_miss=misses.append, nodes=nodes.nodes.values())
+    pool = pool_of(executor)
+    with Spinning(executor):
+        matched(start)
+        assert wait_for(nodes.connected)
+        start.publish(Header())
+        assert began.wait(60.0)
+        with pool.lock:
+            thread, = (each for each in pool.threads() if each.work is not None)
+            if has_ended:
+                may_end.set()
+                assert wait_for(lambda: thread.outcome is not RUNS)
+            pool.now += 10 ** 12        # the deadline is over
+            pool.due.overdue.come_due()
+            assert pool.engine.verdicts.missed == (not has_ended)
+        may_end.set()
+        assert wait_for(lambda: executor.statistics()['dags']['once']['ends']['completed'] == 1)
+    assert [miss.kind for miss in misses] == ['overdue'] * (not has_ended)
 
 
 def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path, capfd):
