@@ -921,11 +921,16 @@ class Engine:
             if self.recorder is not None and state.recorded_by != self.recorder.number:
                 self.recorder.publisher(publisher, state)
             if is_on_behalf and work is not None:
-                self._records.on_behalf(work, self.origin_of(work) or NO_ORIGIN, now, vtid)
+                self.record_on_behalf(work, now, vtid)
             self._records.publication(state.address, message, now, vtid)
         topic, watch = state.topic, self.path_watch
         if work is not None and watch is not None and topic in watch.topics:
             work.sent += (topic, now),
+
+    def record_on_behalf(self, work: Work, now: int, vtid: int) -> None:
+        """Record on behalf of which execution a thread publishes next."""
+        if self._records is not None:
+            self._records.on_behalf(work, self.origin_of(work) or NO_ORIGIN, now, vtid)
 
     def job_of(self, work: Work) -> tuple[str, int, int] | None:
         """Return DAG, index and release of the job of a running execution; None: no job."""

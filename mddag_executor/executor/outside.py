@@ -29,16 +29,23 @@ Outsiders = tuple[tuple[str, str, str, int], ...]
 """Node, topic, callback or task (empty: none), and the number of its messages."""
 
 
+def _log(text: str) -> None:
+    get_logger('mddag_executor').warning(text)
+
+
 class Outside:
     """
     Counts these messages.
 
     :param nodes: returns the nodes of the executor.
+    :param warn: receives a warning.
     """
 
     def __init__(
-        self, task_set: TaskSet, nodes: Callable[[], Iterable[Any] | None]
+        self, task_set: TaskSet, nodes: Callable[[], Iterable[Any] | None],
+        warn: Callable[[str], object] = _log,
     ) -> None:
+        self._warn = warn
         self._task_set = task_set
         self._nodes_now = nodes
         # by the address of the publisher: the counts by callback or task, its node, and its topic
@@ -67,7 +74,7 @@ class Outside:
             self._has_warned.add(address)
             text = outside_text(self._task_set, node, state.topic, {by: number}, only_silent=True)
             if text is not None:
-                get_logger('mddag_executor').warning(text)
+                self._warn(text)
 
     def _node_of(self, publisher: Any) -> str:
         for node in self._nodes_now() or ():

@@ -47,7 +47,8 @@ class Starter:
     """
     The execution that has started some code; it is not kept alive.
 
-    :param work: the execution (``Work``), which runs in ``pool`` (a ``WorkerPool``).
+    :param work: the execution (``Work``), which runs in ``pool`` (a ``WorkerPool``, or the loop of
+        a rerun).
     """
 
     __slots__ = ('_pool', '_work')
@@ -104,7 +105,10 @@ def forget_starter(thread: threading.Thread) -> None:
     thread.__dict__.pop(_ATTRIBUTE, None)
 
 
-def _run(starter: Starter, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+def run_for(
+    starter: Starter | None, function: Callable[..., Any], /, *args: Any, **kwargs: Any
+) -> Any:
+    """Call a function that works on behalf of an execution; None: of none."""
     token = _starter.set(starter)
     try:
         return function(*args, **kwargs)
@@ -139,7 +143,7 @@ def install(starter_here: Callable[[], Starter | None]) -> None:
             return submit(self, function, *args, **kwargs)
         before, _calling.is_submitting = _calling.is_submitting, True
         try:
-            return submit(self, _run, starter, function, *args, **kwargs)
+            return submit(self, run_for, starter, function, *args, **kwargs)
         finally:
             _calling.is_submitting = before
 

@@ -70,9 +70,13 @@ def starter_here() -> Starter | None:
     running = current.running
     if running is None:
         return starter_outside()
-    work = running.work
-    if work is None or work.origin is not None or work.answers is not None:
-        return None if work is None else Starter(work, running.pool)
+    return None if running.work is None else starter_of(running.work, running.pool)
+
+
+def starter_of(work: Work, pool: Any) -> Starter | None:
+    """Return the starter of what an execution starts that runs in a pool; None: it has no job."""
+    if work.origin is not None or work.answers is not None:
+        return Starter(work, pool)
     return work.starter
 
 

@@ -16,6 +16,9 @@ long as ``times`` says, on the CPUs and with the interpreter that it shares as i
 (``simulate.machine``), or as long as it has waited, if that is more. Its messages are kept until
 its virtual end, or until it begins to wait, because others may have to answer them.
 
+What a callback has started, threads and tasks for instance, publishes on its behalf until its
+virtual end, as live (``executor.starters``). Such messages leave at once.
+
 A message that another thread sends has no virtual time: it gets the time at which it arrives, and
 a warning says so.
 
@@ -32,6 +35,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from heapq import heappop, heappush
@@ -45,7 +49,8 @@ from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.compat import NEXT_TURN
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.sent_requests import Heritage
-from mddag_executor.executor.work import Destroyed, Refused, Work
+from mddag_executor.executor.starters import Claim, run_for
+from mddag_executor.executor.work import Destroyed, Refused, starter_of, Work
 from mddag_executor.hosting.loading import describe
 from mddag_executor.rerun.durations import Durations
 from mddag_executor.rerun.errors import CallbackFailed, RerunError
@@ -111,7 +116,10 @@ class Loop:
     :ivar changed: whether there may be new entities, or some are gone.
     :ivar warnings: what is not the same in each run, or doubtful, one line each.
     :ivar on_ended: called with rclpy's entity when its callback has ended.
+    :ivar lock: none is needed, as one thread runs at a time.
     """
+
+    lock = nullcontext()
 
     def __init__(
         self, engine: Engine, times: Durations, cpus: int | None, python: bool, start: int,
@@ -182,6 +190,10 @@ class Loop:
     def current(self) -> Execution | None:
         """Return the execution whose callback runs in the calling thread; None for no callback."""
         return self._current if self.in_run else None
+
+    def is_inside(self) -> bool:
+        """Return whether the calling thread owns the lock, as ``WorkerPool.is_inside`` does."""
+        return False
 
     def heritage(self, of_task: bool = False) -> Heritage | None:
         """Return what a request of the calling callback inherits, or its task; None: nothing."""
@@ -302,7 +314,8 @@ class Loop:
         entity = work.entity
         self._current = execution
         try:
-            execution.waits_for = work.run() if entity.gate is None else entity.gate(work)
+            run = work.run if entity.gate is None else partial(entity.gate, work)
+            execution.waits_for = run_for(starter_of(work, self), run)
         except Destroyed as why:
             self.engine.destroyed(work, self.now, why.reason)
             return False
@@ -371,17 +384,27 @@ class Loop:
         work.coroutine.suspended(in_run)
         self.at(self.now + POLL_NS, ARRIVED, resume)
 
-    def send(self, leave: Leave, record: Callable[[int], None] = lambda thread: None) -> None:
+    def send(
+        self, leave: Leave, record: Callable[[int], None] = lambda thread: None,
+        claim: Claim | None = None,
+    ) -> None:
         """
         Send something: when the callback that runs ends, or else at once.
 
         :param record: records that, as done by a thread of the trace.
+        :param claim: on whose behalf it is sent; None: of the callback that runs, if any.
         """
         execution = self.current
-        if execution is not None:
+        if execution is not None and claim is None:
             execution.sent.append((leave, record))
-        else:
+        elif not self.in_run:
             self.call_in_run(partial(leave, None, 0))
+        else:
+            record(_LENT + next(self._order))
+            if claim is None:
+                leave(None, 0)
+            else:
+                leave(claim.origin, self.engine.open_release(claim.origin) or 0)
 
     # --- waiting ---------------------------------------------------------------------------------
 

@@ -16,7 +16,8 @@ subscribes to another topic later, its later messages are loaded and arrive. If 
 subscribes to ``/clock``, and it is neither recorded nor published by a node, it gives virtual
 time.
 
-Which job does a message belong to?  That of the execution that has sent it. A recorded one starts
+Which job does a message belong to?  That of the execution that has sent it, or that has started
+the code that sends it. A recorded one starts
 a job if its subscription is its DAG's source. Otherwise it enters the job
 that its header's stamp names, or one of its own (see ``executor.other_processes``).
 
@@ -37,9 +38,11 @@ from mddag_executor.clocks import TraceClock
 from mddag_executor.executor.attribution import header_stamp, NO_ORIGIN, Origin
 from mddag_executor.executor.compat import alive, callback_type, WITH_INFO
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.outside import Outside
 from mddag_executor.executor.publishing import state_of
 from mddag_executor.executor.sources import SubscriptionEntity
 from mddag_executor.executor.stamps import StampedReleases
+from mddag_executor.executor.starters import Claim, starter_outside
 from mddag_executor.executor.work import Work
 from mddag_executor.replacements import instead, Replacements
 from mddag_executor.rerun.durations import Durations
@@ -96,9 +99,10 @@ class Messages:
 
     def __init__(
         self, loop: Loop, recording: MessageBag, times: Durations, outputs: Outputs,
-        clock: TraceClock,
+        clock: TraceClock, outside: Outside,
     ) -> None:
         self._loop = loop
+        self._outside = outside
         self._subscriptions: dict[str, list[Entity]] = {}
         self.offered: dict[str, list[Outlet]] = {}
         self._engine = loop.engine
@@ -214,18 +218,45 @@ class Messages:
             self._loop.warn(
                 f'{outlet.state.topic}: a thread publishes on it that is not of the run: when '
                 'that happens depends on the machine')
-        current = self._loop.current
-        if current is not None:
-            work, topic = current.work, outlet.state.topic
-            work.entity.publishes.add(topic)
-            self._engine.answers.note_published(work, topic, msg)
-            self._engine.attribution.note_optional(
-                topic, self._engine.origin_of(work) or NO_ORIGIN)
-        self._loop.send(partial(self._leave, outlet, data),
-                        partial(self._record, outlet, max(0, header_stamp(msg))))
+        claim = self._claim(outlet, msg) if self._loop.in_run else None
+        # a live run records what callbacks publish, and all on the topics of declared ones
+        is_recorded = self._loop.current is not None or (
+            outlet.state.topic in self._engine.attribution.topics)
+        self._loop.send(
+            partial(self._leave, outlet, data),
+            partial(self._record, outlet, max(0, header_stamp(msg)), claim)
+            if is_recorded else lambda thread: None, claim)
 
-    def _record(self, outlet: Outlet, header: int, thread: int) -> None:
+    def _claim(self, outlet: Outlet, msg: Any) -> Claim | None:
+        """
+        Note that code of the run publishes a message.
+
+        :return: on behalf of which execution; None: of the callback that runs, or of none.
+        """
+        execution, topic, engine = self._loop.current, outlet.state.topic, self._engine
+        work = None if execution is None else execution.work
+        if work is not None:
+            work.entity.publishes.add(topic)
+            engine.answers.note_published(work, topic, msg)
+            origin = engine.origin_of(work)
+            engine.attribution.note_optional(topic, origin or NO_ORIGIN)
+            if origin is not None:
+                return None
+        if topic not in engine.attribution.topics:
+            return None
+        starter = starter_outside() if work is None else work.starter
+        claim = None if starter is None else starter.claim(topic, msg)
+        if claim is not None:
+            claim.work.entity.publishes.add(topic)
+        elif work is None or work.entity.callback is None:
+            self._outside.note(outlet.publisher, outlet.state,
+                               '' if work is None else work.entity.name, engine.is_judging)
+        return claim
+
+    def _record(self, outlet: Outlet, header: int, claim: Claim | None, thread: int) -> None:
         if self._engine.record is not None:
+            if claim is not None:
+                self._engine.record_on_behalf(claim.work, self._loop.now, thread)
             self._sequence += 1
             self._engine.record(
                 PUBLICATION, self._loop.now, thread, outlet.state.address, self._sequence,

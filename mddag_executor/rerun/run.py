@@ -26,6 +26,7 @@ from mddag_executor.core import DEFAULT_DEADLINE_NS, EXPIRE_AFTER_NS, MAX_ACTIVE
 from mddag_executor.executor import publishing
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.other_processes import OtherProcesses
+from mddag_executor.executor.outside import Outside
 from mddag_executor.executor.recorder import Recorder
 from mddag_executor.executor.registry import Registry, snapshot
 from mddag_executor.executor.shutdown import is_over
@@ -171,7 +172,9 @@ class Rerun:
             engine.recorder = self._recorder
         self._holder = NodeHolder(context, loop, self._recorder)
         self._registry = Registry(task_set, engine, engine.leave_group, self._recorder)
-        self._messages = Messages(loop, recording, self.times, self._outputs, clock)
+        self._messages = Messages(
+            loop, recording, self.times, self._outputs, clock,
+            Outside(task_set, self._holder.ordered_nodes, loop.warn))
         self._requests = Requests(loop, self._holder, self._registry)
         self._timers = Timers(loop, self.times.first_release)
         self._host = RerunHost(loop)

@@ -34,6 +34,8 @@ import time
 import traceback
 from typing import Any
 
+from mddag_executor.executor.starters import forget_starter
+
 _CHECK_S = 0.05
 _LONGEST_CHECK_S = 1.0
 """More time between two checks is that of a process that was stopped."""
@@ -128,8 +130,10 @@ class RunThreads:
             return
         driver = RunThread('driver')
         self._give(driver)
-        threading.Thread(
-            target=self._run_driver, args=(driver,), daemon=True, name='mddag-rerun').start()
+        thread = threading.Thread(
+            target=self._run_driver, args=(driver,), daemon=True, name='mddag-rerun')
+        forget_starter(thread)  # it runs any callbacks
+        thread.start()
 
     def _begin(self, run_thread: RunThread) -> None:
         self._here.run_thread = run_thread
