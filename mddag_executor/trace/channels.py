@@ -164,7 +164,8 @@ class Channels:
         defaults = EVENTS[name].defaults if table else {}
         missing = [field for field in layout.fields if field not in fields]
         others = [*names, *missing]
-        places = [others.index(field) for field in (*preamble, *layout.fields)]
+        place_of = {field: place for place, field in enumerate(others)}
+        places = [place_of[field] for field in (*preamble, *layout.fields)]
         rest = tuple(defaults.get(field) for field in missing)
 
         def decode(data: bytes) -> Event:
@@ -175,15 +176,15 @@ class Channels:
         fixed = cdr.fixed_layout(types)
         if (fixed is not None and places == list(range(len(others)))
                 and all(field in defaults for field in missing)):
-            ends = [struct.calcsize('<' + fixed[:i + 1])
-                    for i, code in enumerate(fixed) if code != 'x']
             formats = ['<' + code for code in fixed if code != 'x']
-            before = len(cdr.ENCAPSULATION)
+            offsets, end = [], len(cdr.ENCAPSULATION)
+            for code in fixed:
+                if code != 'x':
+                    offsets.append(end)
+                end += struct.calcsize('<' + code)
             self.fixed[number] = Fixed(head, np.dtype({
-                'names': names, 'formats': formats,
-                'itemsize': before + struct.calcsize('<' + fixed), 'offsets': [
-                    before + end - struct.calcsize(code) for end, code in zip(ends, formats)]}), {
-                        field: defaults[field] for field in missing})
+                'names': names, 'formats': formats, 'itemsize': end, 'offsets': offsets}), {
+                    field: defaults[field] for field in missing})
 
 
 def _fields_of(topic: Topic) -> dict[str, FieldType]:

@@ -337,10 +337,15 @@ for path in sys.argv[1:]:
             text = f'error {error}'
         assert time.process_time() - start < 5, path
         print(text)
-    try:
-        list(TraceReader(path).messages({'/trace/ros2/callback_end'}))
-    except TraceError as error:
-        assert str(error).startswith(path)
+    for read in (lambda reader: reader.messages({'/trace/ros2/callback_end'}),
+                 lambda reader: reader.batches({'ros2:callback_end'}, as_table=False)):
+        start = time.process_time()
+        try:
+            for _ in read(TraceReader(path)):
+                pass
+        except TraceError as error:
+            assert str(error).startswith(path)
+        assert time.process_time() - start < 5, path
 print(int(open('/proc/self/status').read().split('VmHWM:')[1].split()[0]) // 1024)
 """
 
