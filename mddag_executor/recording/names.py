@@ -101,6 +101,7 @@ class Names:
     :ivar symbols: the functions of otherwise unknown callbacks.
     :ivar vertices: by callback a vertex of its declared callback, for executions without job.
     :ivar processes: in a recording of another executor by process id a name.
+    :ivar process_names: of several processes their names, by the numbers of columns ``process``.
     :ivar workers: names of workers, if they are more than a number.
     :ivar drop_reasons: names of the values of ``drops['reason']``.
     :ivar places: names of the values of ``unfinished['where']``.
@@ -116,6 +117,7 @@ class Names:
     symbols: dict[int, str] = field(default_factory=dict)
     vertices: Mapping[int, int] = field(default_factory=dict)
     processes: Mapping[int, str] = field(default_factory=dict)
+    process_names: Sequence[str] = ()
     workers: Sequence[str] = ()
     drop_reasons: Sequence[str] = ()
     places: Sequence[str] = ()

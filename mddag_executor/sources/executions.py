@@ -343,11 +343,17 @@ class ExecutionJoin:
             COMPLETED, len(row), place=complete.place[event], time=time[which], row=row))
 
 
-def unfinished_rows(several: Sequence[tuple[int, int, str]]) -> tuple[Table, Sequence[str]]:
-    """Return unfinished executions, given by callback, start and place, and the places' names."""
-    places = list(dict.fromkeys(place for _, _, place in several))
-    callback, start, where = zip(*several) if several else ((), (), ())
-    return rows(UNFINISHED, len(several), callback=callback, start=start,
+def unfinished_rows(
+    several: Sequence[tuple[int, int, str, int]]
+) -> tuple[Table, Sequence[str]]:
+    """
+    Return unfinished executions and the names of the places where they were.
+
+    :param several: callback, start, place and process of each.
+    """
+    places = list(dict.fromkeys(place for _, _, place, _ in several))
+    callback, start, where, process = zip(*several) if several else ((), (), (), ())
+    return rows(UNFINISHED, len(several), process=process, callback=callback, start=start,
                 where=[places.index(each) for each in where]), tuple(places)
 
 

@@ -224,6 +224,7 @@ class ImportedJobs:
         """
         runs, known = self._links.runs, self._row >= 0
         self.releases['release'] = release
+        self.releases['process'] = table['process'][self.sources]
         table['vertex'], table['leg'] = self._vertex, self._leg
         table['guessed'] = self._guessed
         table['ready'] = table['ready'][self._first]
@@ -263,10 +264,10 @@ class ImportedJobs:
             of['order'] += np.where(
                 of['order'] >= 0, 2 * np.searchsorted(before, of['order']), 0).astype(
                     of['order'].dtype)
-        dag = self.releases['dag'][after]
+        process, dag = (self.releases[name][after] for name in ('process', 'dag'))
         ended = self._rows_of(self.ends)
         releases = concatenate([self.releases, rows(
-            RELEASES, len(skipped), dag=dag, release=skipped['release'],
+            RELEASES, len(skipped), process=process, dag=dag, release=skipped['release'],
             noticed=skipped['noticed'], order=place)])
         for mine in rows_by(releases['dag'], len(self._dags)):
             mine = mine[sort_by(releases['order'][mine])]
@@ -275,8 +276,9 @@ class ImportedJobs:
         table['job'][known] = releases['job'][self._row[known]]
         self.ends['job'] = releases['job'][ended]
         ends = concatenate([self.ends, rows(
-            JOB_ENDS, len(skipped), dag=dag, job=releases['job'][len(self.releases):],
-            time=skipped['noticed'], reason=EXPIRED, order=place + 1)])
+            JOB_ENDS, len(skipped), process=process, dag=dag,
+            job=releases['job'][len(self.releases):], time=skipped['noticed'], reason=EXPIRED,
+            order=place + 1)])
         self.releases = releases[sort_by(releases['order'])]
         self.ends = ends[sort_by(ends['order'])]
 
@@ -360,7 +362,8 @@ class ImportedJobs:
         doubted, at = withdrawn[ended], closed[ended]
         time = np.append(self.releases['noticed'], UNKNOWN)[at]
         return rows(
-            JOB_ENDS, len(ended), dag=dags[ended], job=job[ended],
+            JOB_ENDS, len(ended), process=self.releases['process'][ended], dag=dags[ended],
+            job=job[ended],
             time=np.where(doubted, UNKNOWN, time),
             reason=np.where(doubted, WITHDRAWN, EXPIRED)), at
 

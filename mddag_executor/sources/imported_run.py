@@ -163,7 +163,8 @@ class ImportedRun:
                         places=places)
         if self._imported:
             processes = dict(zip(self._pids, process_names(self._pids, self._events.names)))
-            names = replace(names, processes=processes)
+            names = replace(
+                names, processes=processes, process_names=tuple(processes.values()))
             run = replace(
                 run, placed=self._placed(processes), workers_each=self._workers_each())
         found = self._completed(Recording(run, Columns(
@@ -215,7 +216,8 @@ class ImportedRun:
             workers.get(self._events.threads[thread], UNKNOWN) if has_worker else UNKNOWN
             for thread, has_worker in zip(runs['thread'][mine].tolist(), self._have_workers(mine))]
         return unfinished_rows([*zip(
-            table['callback'][mine].tolist(), table['start'][mine].tolist(), self._places(mine))])
+            table['callback'][mine].tolist(), table['start'][mine].tolist(), self._places(mine),
+            table['process'][mine].tolist())])
 
     def _number_pieces(self, table: Table) -> None:
         """Do nothing: each execution has one piece."""
@@ -264,15 +266,21 @@ class ImportedRun:
         declared = [each.number in self._vertex for each in self.links.callbacks]
         known = np.array(declared, dtype=np.bool_)[runs['callback']]
         by_thread = [pid for pid, _ in self._events.threads]
-        of_declared, every = (
+        sent = self._events.table['thread'][self.links.messages['at']]
+        of_declared, every, sending = (
             sorted({by_thread[each] for each in distinct(threads).tolist()})
-            for threads in (runs['thread'][known], runs['thread']))
-        self._pids = list(dict.fromkeys([*of_declared, *every]))
+            for threads in (runs['thread'][known], runs['thread'], sent))
+        self._pids = list(dict.fromkeys([*of_declared, *every, *sending]))
         self._n_declared = len(of_declared)
-        if not self._imported:
-            return np.zeros(len(runs), dtype=np.int64)
-        number = {pid: place for place, pid in enumerate(self._pids)}
-        return _values([number.get(pid, UNKNOWN) for pid in by_thread], runs['thread'])
+        #: By process id its number in tables; of this executor there is one.
+        self._process = {pid: place if self._imported else 0
+                         for place, pid in enumerate(self._pids)}
+        return self._process_of_threads(runs['thread'])
+
+    def _process_of_threads(self, threads: Ints) -> Ints:
+        """Return the number of the process of each thread."""
+        return _values([self._process.get(pid, UNKNOWN) for pid, _ in self._events.threads],
+                       threads)
 
     def _placed(self, names: Mapping[int, str]) -> list[Process]:
         """Return the nodes of each process in which declared callbacks ran, if it has several."""
@@ -303,7 +311,8 @@ class ImportedRun:
         vertices = [self._publisher_vertex(pair // width, pair % width - 1)
                     for pair in pairs.tolist()]
         return rows(
-            PUBLICATIONS, len(messages), publisher=_values(
+            PUBLICATIONS, len(messages), process=self._process_of_threads(
+                self._events.table['thread'][messages['at']]), publisher=_values(
                 [each.number for each in publishers], messages['publisher']),
             execution=run, time=messages['time'], source_timestamp=messages['stamp'],
             header_stamp=np.where(messages['header'] > 0, messages['header'], UNKNOWN),

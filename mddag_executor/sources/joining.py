@@ -319,6 +319,7 @@ class Joined:
         return Recording(
             run, Columns(**tables), replace(
                 who.names, drop_reasons=reasons, places=places,
+                process_names=tuple(part.label for part in self._parts),
                 # the last word of the trace's name
                 workers=[f'{part.label} {worker}' for part in self._parts
                          for worker in range(part.head.workers)]),

@@ -321,7 +321,7 @@ class _Source:
         self._last_seen = max([self._last_seen, *(event[1] for event in several)])
         added = self._executions.add_unfinished(several, min(self._latest, NEVER - 1))
         return unfinished_rows(
-            [(signed(event[4]), event[10], event[11]) for event in added])
+            [(signed(event[4]), event[10], event[11], 0) for event in added])
 
     def _publications(self, executions: Table, completed: Table) -> Table:
         published = self._pop(_PUBLISH)

@@ -289,6 +289,7 @@ class UndeclaredRun(ImportedRun):
 
     def _completed(self, found: Recording) -> Recording:
         drops, reasons, losses = [], dict[str, int](), []
+        process = self._process
         for event in self._events.others:
             if event[0].name not in (_DROP, _MESSAGES_LOST):
                 continue
@@ -297,15 +298,16 @@ class UndeclaredRun(ImportedRun):
             callback = self.who.callbacks.latest(pid, fields.get('callback', 0), time)
             number = UNKNOWN if callback is None else callback.number
             if 'reason' in fields:
-                drops.append((self._vertex.get(number, UNKNOWN), time,
-                              reasons.setdefault(str(fields['reason']), len(reasons))))
+                drops.append((
+                    process.get(pid, UNKNOWN), self._vertex.get(number, UNKNOWN), time,
+                    reasons.setdefault(str(fields['reason']), len(reasons))))
             elif isinstance(fields.get('count'), int):
-                losses.append((number, time, fields['count']))
-        vertex, times, reason = zip(*drops) if drops else ((), (), ())
+                losses.append((process.get(pid, UNKNOWN), number, time, fields['count']))
+        of, vertex, times, reason = zip(*drops) if drops else ((), (), (), ())
         dropped = rows(
-            DROPS, len(drops), vertex=vertex, job=UNKNOWN, time=times, reason=reason)
-        callbacks, times, count = zip(*losses) if losses else ((), (), ())
-        lost = rows(LOSSES, len(losses), callback=callbacks, time=times, count=count)
+            DROPS, len(drops), process=of, vertex=vertex, job=UNKNOWN, time=times, reason=reason)
+        of, callbacks, times, count = zip(*losses) if losses else ((), (), (), ())
+        lost = rows(LOSSES, len(losses), process=of, callback=callbacks, time=times, count=count)
         return replace(
             found, columns=replace(found.columns, drops=dropped, losses=lost),
             names=replace(found.names, drop_reasons=tuple(reasons)),

@@ -19,12 +19,13 @@ all of its legs.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from mddag_executor.analysis.paths import Paths
 from mddag_executor.analysis.requirements import Requirements
-from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, Tables
+from mddag_executor.core import DEFAULT_DEADLINE_NS, NEVER, processes_of, Tables
 from mddag_executor.core.state import (
     Decision,
     DROP,
@@ -53,7 +54,7 @@ from mddag_executor.simulate import (
 )
 from mddag_executor.simulate.workload import edge_numbers, FAILS
 from mddag_executor.sources.executions import Numbering
-from msg_graph import TaskSet
+from msg_graph import Process, TaskSet
 import numpy as np
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class ComputedRun(NamedTuple):
     :ivar numbers: by DAG the recorded numbers of the load's jobs; None: as in the load.
     :ivar judge_from: jobs released before are not judged; ``judged_releases``: range of judged
         releases, ns; None: all.
+    :ivar processes: the nodes of each process; empty: one process.
     """
 
     task_set: TaskSet
@@ -83,34 +85,39 @@ class ComputedRun(NamedTuple):
     numbers: Sequence[Ints] | None = None
     judge_from: int = -NEVER
     judged_releases: tuple[int, int] | None = None
+    processes: Sequence[Process] = ()
 
     @classmethod
     def of_run(cls, task_set: TaskSet, load: Workload, run: SimulatedRun) -> ComputedRun:
         """Return a run that was simulated with its log."""
         stopped = run.settings.stop_at_first_miss and run.ended_ns < run.settings.duration_ns
         judged = run.settings.judge == 'horizon' and not stopped
-        return cls(task_set, load, run.log, run.decisions, run.ended_ns, judged)
+        return cls(task_set, load, run.log, run.decisions, run.ended_ns, judged,
+                   processes=task_set.processes if run.settings.processes > 1 else ())
 
     def recording(self, workers: int = 0) -> Recording:
         """
         Return the schedule as a recording.
 
-        :param workers: number of workers.
+        :param workers: number of workers of all processes.
         """
         task_set, found = self.task_set, _Tables(self)
         releases, executions, job_ends = found.in_order()
+        count = max(1, len(self.processes))
         run = Run(
             task_set.file, Head(0, task_set.text, task_set.file, '', workers,
                                 DEFAULT_DEADLINE_NS, 0, False),
             task_set, task_set, same=False, unsent=found.unsent(),
             start=earliest(releases['release'], executions['ready']), end=self.end,
-            judged=self.judged, judged_until=self.end, workers_each=workers,
-            judge_from=self.judge_from, judged_releases=self.judged_releases)
+            judged=self.judged, judged_until=self.end, processes=count,
+            workers_each=workers // count, placed=self.processes, judge_from=self.judge_from,
+            judged_releases=self.judged_releases)
         return Recording(
             run, tables.Columns(
                 releases=releases, executions=executions, job_ends=job_ends, drops=found.drops(),
                 demotions=found.demotions()),
-            Names(symbols={0: 'undeclared callbacks'}, drop_reasons=('newer', 'expired')))
+            Names(symbols={0: 'undeclared callbacks'}, drop_reasons=('newer', 'expired'),
+                  process_names=tuple(each.name for each in self.processes)))
 
     def requirements(self) -> PathsResult:
         """Return ``paths`` and ``requirements`` of the result; nothing if nothing is required."""
@@ -162,6 +169,9 @@ class _Tables:
                                  for each in schedule.load))
         self._tables = Tables.build(schedule.task_set)
         self._n_dags = self._tables.n_dags
+        #: By vertex the number of its process; the last one is that of undeclared callbacks.
+        self._process = np.array([*processes_of(
+            replace(schedule.task_set, processes=tuple(schedule.processes))), 1]) - 1
         self._log = _columns(schedule.log)
         self._decisions = _columns(schedule.decisions)
 
@@ -213,8 +223,13 @@ class _Tables:
     def _releases(self, rows: Ints) -> Table:
         now, _, _, dag, release, job = self._log[:, rows]
         return table_of(
-            tables.RELEASES, len(rows), dag=dag, job=self._numbers(dag, job), release=release,
-            noticed=now, order=_position(rows))
+            tables.RELEASES, len(rows), process=self._process_of(dag), dag=dag,
+            job=self._numbers(dag, job), release=release, noticed=now, order=_position(rows))
+
+    def _process_of(self, dag: Ints) -> Ints:
+        """Return the processes of the sources of DAGs."""
+        found: Ints = self._process[np.array(self._tables.source, dtype=np.int64)[dag]]
+        return found
 
     def _job_ends(self, failed: Ints, early: Ints) -> Table:
         """
@@ -227,7 +242,7 @@ class _Tables:
         reason = np.array([_REASONS[each] for each in how.tolist()], dtype=np.int64)
         dag, job = np.r_[pieces.dag[failed], dag], np.r_[pieces.job[failed], job]
         found = table_of(
-            tables.JOB_ENDS, len(dag), dag=dag,
+            tables.JOB_ENDS, len(dag), process=self._process_of(dag), dag=dag,
             vertex=np.r_[pieces.vertex[failed], np.full(len(early), UNKNOWN)],
             job=self._numbers(dag, job), time=np.r_[pieces.end[failed], now],
             reason=np.r_[np.full(len(failed), tables.FAILED), reason],
@@ -251,7 +266,8 @@ class _Tables:
         callback = np.r_[np.array(task_set.places_of_vertices(), dtype=np.int64) + 1, 0]
         legs = np.where(Numbering(task_set).n_legs > 1, tables.ALL_LEGS, 0)
         return table_of(
-            tables.EXECUTIONS, len(first), callback=callback[each.vertex],
+            tables.EXECUTIONS, len(first), process=self._process[each.vertex],
+            callback=callback[each.vertex],
             dag=np.where(declared, each.dag, -1), vertex=np.where(declared, each.vertex, -1),
             job=self._numbers(each.dag, each.job), leg=np.where(completes, legs[each.vertex], 0),
             piece=np.arange(len(first)) - first, thread=each.worker + 1, worker=each.worker,
@@ -303,14 +319,15 @@ class _Tables:
                 ended[dag[row], job[row]] = _DROPS.index(end[row])
         rows = np.array(found, dtype=np.int64)
         return table_of(
-            tables.DROPS, len(rows), vertex=vertex[rows], job=self._numbers(dag[rows], job[rows]),
-            time=now[rows], reason=reasons)
+            tables.DROPS, len(rows), process=self._process[vertex[rows]], vertex=vertex[rows],
+            job=self._numbers(dag[rows], job[rows]), time=now[rows], reason=reasons)
 
     def demotions(self) -> Table:
         """Return the demotions of sinks."""
         _, dag, vertex, job, _, time = self._decisions[:, self._decisions[0] == SINK_DEMOTED]
-        return table_of(tables.DEMOTIONS, len(dag), dag=dag, vertex=vertex,
-                           job=self._numbers(dag, job), time=time)
+        return table_of(
+            tables.DEMOTIONS, len(dag), process=self._process[vertex], dag=dag, vertex=vertex,
+            job=self._numbers(dag, job), time=time)
 
     def unsent(self) -> dict[tuple[int, int], Ints]:
         """Return by the vertices of an edge the jobs in which nothing was published on it."""

@@ -109,7 +109,8 @@ class Reschedule:
         end = self.settings.duration_ns
         return ComputedRun(
             self.task_set, self.work.load, self.log, self.decisions, end, True,
-            self.work.jobs, self.settings.judge_from, self._run.run.judged_releases)
+            self.work.jobs, self.settings.judge_from, self._run.run.judged_releases,
+            self.processes)
 
     @cached_property
     def _computed_replay(self) -> Replay:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mddag_executor import open_recording, replay, ReplayError, reschedule
 from mddag_executor.errors import UsageError
+from mddag_executor.recording.tables import FAILED
 from mddag_executor.sources.open import Traces
 from msg_graph import load, loads
 import pytest
@@ -147,6 +148,28 @@ def test_a_timer_of_this_executor_starts_jobs_that_come_back(tmp_path):
     found = result['dags']['/front']['sinks']['/front:plan']
     assert (found['completed'], found['response_ns']) == (N, same(12 * MS))
     assert found['breakdown']['mean']['release_lag_ns'] == 300 * US
+
+
+def test_all_tables_name_the_process_and_join(tmp_path, graph):
+    """`process` is the row of the table of processes, in each table that has it."""
+    paths = [detector(tmp_path / 'own.mcap', declared=True, fails=(3,)),
+             str(robot(tmp_path / 'lttng.mcap', n=8).write())]
+    outcome = replay(paths, graph)
+    processes = outcome.table('processes')
+    names = dict(zip(processes['process'].tolist(), processes['name'].tolist()))
+    assert sorted(names.values()) == ['own', 'robot']
+    assert dict(zip(processes['name'].tolist(), processes['executions'].tolist())) == {
+        'robot': N + 8, 'own': N}
+    run = outcome.recording
+    assert {names[each] for each in run.releases['process'].tolist()} == {'robot'}
+    released = {(each['dag'], each['job']) for each in run.releases.records()}
+    assert {(each['dag'], each['job']) for each in run.job_ends.records()} <= released
+    sent = run.publications[run.publications['execution'] >= 0]
+    assert sent['process'].tolist() == run.executions['process'][sent['execution']].tolist()
+    assert {(names[each['process']], run.names.publishers[each['publisher']].topic)
+            for each in run.publications.records()} == {('robot', '/image'), ('own', '/boxes')}
+    assert {(names[each['process']], each['reason']) for each in run.job_ends.records()} >= {
+        ('own', FAILED)}
 
 
 def test_an_execution_that_raised_has_failed(tmp_path, graph):

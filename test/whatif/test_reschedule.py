@@ -504,3 +504,33 @@ nodes: [{node: /n, callbacks: [{name: t, timer: 100ms, deadline: 90ms}]}]
         done = call('replay', path, '--reschedule', *options)
         assert done.returncode == 0
         assert ('with the recorded pool' in done.stderr) == (points < 0)
+
+
+def test_each_computed_process_has_a_pool_of_its_own(tmp_path):
+    """With one worker each, /a's short callback waits for the long one, and never for /b's."""
+    text = """\
+mddag: 1
+nodes:
+  - node: /a
+    callbacks:
+      - {name: long, timer: 100ms, deadline: 90ms}
+      - {name: short, timer: 100ms, deadline: 10ms}
+  - {node: /b, callbacks: [{name: other, timer: 100ms, deadline: 90ms}]}
+processes: {up: [/a], down: [/b]}
+"""
+    run = Written(tmp_path / 'a.mcap', text, workers=4)
+    for job in range(3):
+        at = 100 * job
+        for dag, begin, took in ((0, at, 30), (1, at + 1, 2), (2, at, 20)):
+            run.release(dag, job, begin)
+            run.run(dag, 0, job, begin, begin + took, worker=dag)
+    outcome = reschedule(
+        run.end(400), workers=1, policy='fifo', processes=lambda declared, _: declared.processes)
+    processes = outcome.table('processes')
+    assert (processes['name'].tolist(), processes['executions'].tolist()) == (
+        ['up', 'down'], [6, 3])
+    assert set(outcome.table('behind')['callback'].tolist()) == {'/a:long'}
+    for name in ('releases', 'executions'):
+        table, declared = outcome.table(name), outcome.task_set.dags
+        nodes = [declared[dag].vertices[0].callback.node for dag in table['dag'].tolist()]
+        assert [('/a', '/b')[each] for each in table['process'].tolist()] == nodes
