@@ -25,7 +25,7 @@ along its critical chain (see ``chains``):
   *ran long* beyond.  If its CPU time is recorded, shows computing and is not unusual, the excess
   is *interpreter* while other callbacks held the GIL, else *machine*: it got no CPU;
 * end of a callback until the next one is ready: *transport*; *other topic* if the next one is a
-  driven sync that completed with a message of another topic than the driving one;
+  driven sync that had its driving message and got one of another topic later, or not at all;
 * ready callback in a process of another executor, which does not say when a message or timer was
   noticed: *waited* while its own thread ran a callback; with an idle thread *released late* (a
   source), else *transport*, because the message was still on its way;
@@ -111,9 +111,10 @@ _ABOUT_BITS = 4     # up to a 16th above the usual time is usual
 
 MISSED = np.dtype([
     ('kind', 'i8'), ('sink', 'i8'), ('job', 'i8'), ('release', 'i8'), ('until', 'i8'),
-    ('at', 'i8'), ('length', 'i8'), ('demoted', 'i8'), ('outranked', '?')])
+    ('at', 'i8'), ('in_job', 'i8'), ('length', 'i8'), ('demoted', 'i8'), ('outranked', '?')])
 """
-Columns of a miss: ``at`` is the vertex that the job reached, ``length`` the length of its chain,
+Columns of a miss: ``at`` is the vertex that the job reached, ``in_job`` the job whose executions
+completed it there (a later one, if a driven sync answered that one), ``length`` of its chain,
 ``demoted`` when it was demoted, ``outranked`` whether it could still have been in time then.
 """
 PARTS_OF = np.dtype([
@@ -221,6 +222,7 @@ class Never(NamedTuple):
         causes of the misses that follow.
     :ivar started: executions that were started, a table of ``STARTED``.
     :ivar unpublished: by miss whether the callback before did not publish the message.
+    :ivar is_driven: by vertex whether it is a driven sync.
     :ivar knows_waiting: whether the executions that waited at the end are recorded: each process
         has ended in order.
     """
@@ -229,6 +231,7 @@ class Never(NamedTuple):
     dropped_at: dict[int, tuple[Ints, Ints]]
     started: Table
     unpublished: Mask
+    is_driven: Mask
     knows_waiting: bool
 
     def drops_of(self, vertex: Ints, job: Ints) -> Ints:
@@ -492,15 +495,18 @@ def _pending(
     which = np.flatnonzero(spans['kind'] == _PENDING)
     miss, vertex, begin, end = (
         spans[name][which] for name in ('miss', 'vertex', 'begin', 'end'))
-    job, source, length = rows['job'][miss], is_source[vertex], end - begin
+    job, source, length = rows['in_job'][miss], is_source[vertex], end - begin
     start, drop = never.starts_of(vertex, job), never.drops_of(vertex, job)
     began, dropped = np.append(never.started['start'], 0)[start], drop >= 0
     waits = np.append(never.dropped['aborted'], False)[drop] | (start >= 0) & (
         np.append(never.started['ready'], 0)[start] < end) & (end <= began)
+    # a driven sync with its driving message: the larger part of the time counts
+    answerless = never.is_driven[vertex] & (start >= 0) & (began < end) & ~dropped
+    waits |= answerless & (began - begin > end - began)
     group = np.minimum(np.append(never.started['group'], 0)[start], length)
     behind = np.where(source & ~dropped, never.waiting(vertex, end), -1)
     if pool.knows_workers:
-        may_wait = np.flatnonzero(~waits & ~dropped & (
+        may_wait = np.flatnonzero(~waits & ~dropped & ~answerless & (
             (rows['kind'][miss] != SINK_EXPIRED) | source))
         full = pool.within('full', spans[which[may_wait]])
         waits[may_wait] = 2 * full >= length[may_wait]
@@ -515,7 +521,7 @@ def _pending(
     part = np.where(
         source & ~dropped,
         np.where(behind >= 0, SKIPPED, RELEASED_LATE),
-        never.causes(miss, vertex, job, begin, end))
+        np.where(answerless, OTHER_TOPIC, never.causes(miss, vertex, job, begin, end)))
     other = which[~waits]
     times[other, part[~waits]] = left[other]
     ended = ~waits & dropped
@@ -573,7 +579,7 @@ def _given_up(
     """
     found = causes[which]
     kind, job, at, release, until = (
-        rows[name][which] for name in ('kind', 'job', 'at', 'release', 'until'))
+        rows[name][which] for name in ('kind', 'in_job', 'at', 'release', 'until'))
     dropped = never.drops_of(at, job) >= 0
     skips = is_source[at] & ~dropped
     lost = ~skips & (dropped | (kind == SINK_EXPIRED))

@@ -236,13 +236,14 @@ class Chains:
 
     # --- misses ----------------------------------------------------------------------------------
 
-    def of_misses(self, dag: int, missed: Table) -> tuple[Ints, Table]:
+    def of_misses(self, dag: int, missed: Table) -> tuple[Ints, Ints, Table]:
         """
         Return the chains of the misses of a DAG, as far as their jobs got.
 
         :param missed: verdicts.
-        :return: the last vertex that each job reached, and the links; ``of`` is the row in
-            ``missed``.
+        :return: the last vertex that each job reached; the job in which it went on there: a later
+            one, if a driven sync was completed by the answer to that one; and the links, whose
+            ``of`` is the row in ``missed``.
         """
         legs = self._legs[dag]
         width = max(1, *map(len, legs))
@@ -250,8 +251,8 @@ class Chains:
         row = self._of_dag(dag)[0][:, missed['row']].T
         row[self._executions['began'][row] > missed['until'][:, None]] = -1
         # a sync that has not got all of its messages has run, but is where the job ended
-        unfinished = (row < 0) | (self._is_other[row] & ~self._is_driven[dag]
-                                  & (self._executions['completes'][row] == LEG))
+        unfinished = (row < 0) | (
+            self._is_other[row] & (self._executions['completes'][row] == LEG))
         end = np.where(self._is_other[row], NEVER, self._executions['end'][row])
         every, at = np.arange(len(missed)), missed['sink'] - self._first[dag]
         back = np.flatnonzero(missed['kind'] != SINK_LATE)
@@ -269,7 +270,9 @@ class Chains:
         last = np.where(waits, publishers[every, ends.argmax(axis=1)], at)
         which = np.flatnonzero(row[every, last] >= 0)
         found = list(self._follow(dag, which, last[which], missed['row'][which]))
-        return at + self._first[dag], concatenate([rows(LINKS), *found])
+        job = np.where(row[every, last] >= 0, self._executions['job'][row[every, last]],
+                       missed['job'])
+        return at + self._first[dag], job, concatenate([rows(LINKS), *found])
 
     # --- breakdown -------------------------------------------------------------------------------
 
@@ -330,7 +333,7 @@ class Chains:
             known = self._of_dag(dag)[0][sink, job] >= 0
             found += self._follow(dag, which[known], sink[known], job[known])
             which = np.flatnonzero(mine & ~done)
-            _, links = self.of_misses(dag, verdicts[which])
+            _, _, links = self.of_misses(dag, verdicts[which])
             links['of'] = which[links['of']]
             found.append(links)
         every = concatenate(found)[::-1]    # each chain was followed from its end

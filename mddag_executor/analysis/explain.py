@@ -106,6 +106,8 @@ class Explanation:
         missed['outranked'] = self._outranked(missed, links, usual)
         self._never = Never(
             *self._dropped(), self._started(chains.waited.group), self._unpublished(missed),
+            np.array([*(v.callback.driven_by is not None for v in self._task_set.vertices),
+                      False]),
             self._knows_waiting)
         self.found = find(
             missed, links, pool, usual, self._never,
@@ -136,8 +138,8 @@ class Explanation:
         links: list[Table] = []
         for dag in distinct(verdicts['dag']).tolist():
             mine = np.flatnonzero(verdicts['dag'] == dag)
-            at, of_dag = chains.of_misses(dag, verdicts[mine])
-            missed['at'][mine] = at
+            missed['at'][mine], missed['in_job'][mine], of_dag = chains.of_misses(
+                dag, verdicts[mine])
             of_dag['of'] = mine[of_dag['of']]
             links.append(of_dag)
         every = concatenate([rows(LINKS), *links])
@@ -316,7 +318,7 @@ class Explanation:
         if not recording.names.publishers:
             return found    # a simulated run: its callbacks always publish
         job = recording.jobs.places_of(
-            np.array([*self._tables.dag_of, -1])[missed['at']], missed['job'])
+            np.array([*self._tables.dag_of, -1])[missed['at']], missed['in_job'])
         topic_of = {number: each.topic for number, each in recording.names.publishers.items()}
         for vertex in distinct(missed['at']).tolist():
             mine = np.flatnonzero(missed['at'] == vertex)
@@ -540,7 +542,7 @@ class Explanation:
             found[i]['waiting_job'] = job
         at = np.flatnonzero(np.isin(cause, NO_MESSAGE))
         for i, topics in zip(at.tolist(), self._missing(
-                vertex[at], self.found.misses['job'][parts['miss'][at]])):
+                vertex[at], self.found.misses['in_job'][parts['miss'][at]])):
             found[i]['topics'] = topics
         return found
 

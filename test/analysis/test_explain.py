@@ -524,3 +524,44 @@ def test_what_is_usual_in_the_whole_recording_is_usual_in_a_part(tmp_path):
              for each in (whole, part, again)]
     assert parts[1] == parts[2] == parts[0]
     assert [each['cause'] for each in parts[0]] == ['released late', 'ran long', 'ran']
+
+
+SKIPS = """\
+mddag: 1
+workers: 1
+nodes:
+  - {node: /lidar, callbacks: [{name: read, timer: 100ms, publishes: [/points]}]}
+  - node: /fusion
+    callbacks:
+      - name: fuse
+        sync: {topics: [/points, /boxes], driven_by: /points}
+        publishes: [/fused]
+  - {node: /brake, callbacks: [{name: stop, subscription: /fused, deadline: 150ms}]}
+  - {node: /boxes, callbacks: [{name: find, timer: 100ms, publishes: [/boxes], deadline: 1s}]}
+"""
+
+
+def test_a_scan_that_the_program_skips_loses_no_message(tmp_path):
+    """The answer to a later scan completes it; or it waits for boxes that never come."""
+    trace = Written(tmp_path / 'run.mcap', SKIPS)
+    for job, at in enumerate((0, 100, 1000)):
+        trace.release(0, job, at)
+        trace.run(0, 0, job, at, at + 2)
+        trace.run(0, 1, job, at + 3, at + 4, whole=False)
+    trace.release(1, 0, 140)
+    trace.run(1, 0, 0, 140, 142)
+    trace.run(0, 1, 1, 143, 150)        # with boxes it fuses the second scan
+    trace.release(1, 1, 150)
+    trace.run(1, 0, 1, 150, 900)    # and keeps the only worker
+    for job, at in ((0, 600), (1, 700), (2, 2150)):
+        trace.add('expire', at, 0, job)
+    trace.run(0, 2, 1, 900, 902, ready=150)
+    explained = replay(trace.end(2300)).explanation.result()
+    causes = {job['job']: (job['verdict'], job['cause']) for job in explained['jobs']
+              if job['sink'] == '/brake:stop'}
+    assert causes == {0: ('expired', 'waited'), 1: ('expired', 'waited'),
+                      2: ('expired', 'other topic')}
+    parts = {(job['job'], part['vertex'], part['cause']): part['ns'] // MS
+             for job in explained['jobs'] for part in job['parts']}
+    assert parts[0, '/brake:stop', 'waited'] == 450
+    assert parts[2, '/fusion:fuse', 'other topic'] == 1146
