@@ -33,10 +33,9 @@ import selectors
 import threading
 from threading import get_ident
 import time
-import types
 from typing import Any, Protocol
 
-from mddag_executor.executor.compat import awaited, NEXT_TURN, QuickCallback
+from mddag_executor.executor.compat import QuickCallback
 from mddag_executor.executor.starters import forget_starter
 
 CLOSE_S = 2.0
@@ -160,7 +159,6 @@ class CallbackLoop(asyncio.SelectorEventLoop):
         self._wakes_at = 0.0    # when its thread wakes by itself
         self._thread: threading.Thread | None = None
         self._start_lock = threading.Lock()
-        self.set_task_factory(_task)
 
     def __hash__(self) -> int:
         """Return the hash; its user may be asking for the current task (rule 2)."""
@@ -342,7 +340,7 @@ for _name in vars(asyncio.AbstractEventLoop):
         _take_turn_in(_name)
 
 
-# --- rclpy's futures in asyncio's tasks ----------------------------------------------------------
+# --- names and futures ---------------------------------------------------------------------------
 
 def name_of(coroutine: Any) -> str:
     """Return the name of a coroutine for messages."""
@@ -352,65 +350,3 @@ def name_of(coroutine: Any) -> str:
 def is_asyncio_future(yielded: Any) -> bool:
     """Return whether a coroutine has yielded a future of asyncio, to wait for it."""
     return getattr(yielded, '_asyncio_future_blocking', None) is not None
-
-
-def _task(
-    loop: asyncio.AbstractEventLoop, coroutine: Any, **kwargs: Any
-) -> asyncio.Task[Any]:
-    """Return a task of the loop that may also await futures of rclpy."""
-    if type(coroutine) is types.CoroutineType:
-        coroutine = _bridged(coroutine, loop)
-    return asyncio.Task(coroutine, loop=loop, **kwargs)
-
-
-def _bridged(inner: Any, loop: asyncio.AbstractEventLoop) -> Any:
-    made: Any = _await(_Bridge(inner, loop))
-    made.__name__, made.__qualname__ = inner.__name__, inner.__qualname__
-    return made
-
-
-async def _await(awaitable: Any) -> Any:
-    return await awaitable
-
-
-class _Bridge:
-    """Runs a coroutine within a task of asyncio, where it may await futures of rclpy."""
-
-    __slots__ = ('_inner', '_loop')
-
-    def __init__(self, inner: Any, loop: asyncio.AbstractEventLoop) -> None:
-        self._inner = inner
-        self._loop = loop
-
-    def __await__(self) -> Any:
-        inner, error = self._inner, None
-        while True:
-            try:
-                yielded = inner.send(None) if error is None else inner.throw(error)
-            except StopIteration as stop:
-                return stop.value
-            error = None
-            try:
-                yield yielded if is_asyncio_future(yielded) else self._waiter(yielded)
-            except GeneratorExit:
-                inner.close()
-                raise
-            except BaseException as raised:
-                error = raised
-
-    def _waiter(self, yielded: Any) -> Any:
-        """Return a future of asyncio that is done when the one of rclpy is; None: next turn."""
-        waits_for = awaited(self._inner) if yielded is None else yielded
-        if waits_for is NEXT_TURN:
-            return None
-        waiter = self._loop.create_future()
-        waits_for.add_done_callback(QuickCallback(partial(
-            self._loop.call_soon_threadsafe, set_done, waiter)))
-        waiter._asyncio_future_blocking = True
-        return waiter
-
-
-def set_done(waiter: asyncio.Future[None]) -> None:
-    """Complete a future, unless it has been cancelled or completed."""
-    if not waiter.done():
-        waiter.set_result(None)

@@ -5,8 +5,8 @@ All uses of rclpy beyond its documented interface.
 
 No other module uses a private name of rclpy, or what is behind a handle; ``test/test_layers.py``
 checks that. Each entry lists the versions in which it was seen. *7.1* is Jazzy: 7.1.5, the version
-in the package index, to 7.1.11. *9.1* is Kilted: 9.1.2. Entries without a version are in both, and
-the executor needs them.
+in the package index, to 7.1.11. *9.1* is Kilted: 9.1.2, the one in the package index, to 9.1.5.
+Entries without a version are in both, and the executor needs them.
 
 Adapters to rcl and rmw, which use the ``pointer`` of a handle, are separate modules:
 ``listeners``, ``request_ids`` and ``waitsets``.
@@ -474,10 +474,64 @@ def forget_task_frames(error: BaseException) -> None:
 
 
 HAS_NEXT_SPIN = hasattr(Executor, '_call_task_in_next_spin')
-"""Whether tasks are those of 7.1.9 and later; 9.1.2 does not have them yet."""
+"""Whether tasks are those of 7.1.9 and later, and of 9.1.4 and later."""
 
 NEXT_TURN = object()
 """The awaited object of a coroutine that yields None: it continues in the executor's next turn."""
+
+
+def set_done(waiter: Any) -> None:
+    """Complete a future of asyncio, unless it has been cancelled or completed."""
+    if not waiter.done():
+        waiter.set_result(None)
+
+
+_SUSPENDABLE = inspect.CO_COROUTINE | inspect.CO_GENERATOR | inspect.CO_ITERABLE_COROUTINE
+_DRIVERS = 'rclpy.task', 'mddag_executor.executor.coroutines'
+
+
+def _asyncio_loop() -> Any:
+    """
+    Return the event loop whose task awaits a future of rclpy; None: no such task does.
+
+    The first frame that is not of a coroutine is that of its driver: a task of rclpy, a coroutine
+    of this executor, or otherwise the event loop that runs in this thread.
+    """
+    asyncio = sys.modules.get('asyncio')
+    loop = None if asyncio is None else asyncio._get_running_loop()
+    if loop is None:
+        return None
+    frame: Any = sys._getframe(2)
+    while frame is not None and frame.f_code.co_flags & _SUSPENDABLE:
+        frame = frame.f_back
+    is_other = frame is not None and frame.f_globals.get('__name__') in _DRIVERS
+    return None if is_other else loop
+
+
+_await_in_rclpy: Callable[[Future], Any] = Future.__await__
+
+
+def _await(future: Future) -> Any:
+    """
+    Wait for a future of rclpy, in a task of asyncio as well.
+
+    There, a future of 7.1.9 and of 9.1.4 would raise RuntimeError, and an earlier one would be
+    polled in each turn of the loop.
+    """
+    if not (future.done() or future.cancelled()):
+        loop = _asyncio_loop()
+        if loop is not None:
+            waiter = loop.create_future()
+            callback = QuickCallback(partial(loop.call_soon_threadsafe, set_done, waiter))
+            future.add_done_callback(callback)
+            try:
+                yield from waiter
+            finally:
+                future.remove_done_callback(callback)
+    return (yield from _await_in_rclpy(future))
+
+
+Future.__await__ = _await  # type: ignore[method-assign]
 
 
 def adopt_awaited(future: Any, executor: Any) -> None:
@@ -492,7 +546,7 @@ def awaited(coroutine: Any) -> Any:
     """
     Return the rclpy future that a suspended coroutine waits for, or NEXT_TURN.
 
-    From 7.1.9 on, the coroutine yields it. In 7.1.5 and 9.1 ``Future.__await__`` is a generator
+    From 7.1.9 and 9.1.4 on, the coroutine yields it. Before, ``Future.__await__`` is a generator
     that yields nothing. So the future is looked up at the end of the chain of awaits.
     """
     inner = coroutine

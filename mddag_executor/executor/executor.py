@@ -41,6 +41,7 @@ from mddag_executor.executor.compat import (
     is_quick,
     QuickCallback,
     RCL_ERRORS,
+    set_done,
     TASKS_NEWEST_FIRST,
 )
 from mddag_executor.executor.diagnostics import Diagnostics
@@ -777,7 +778,6 @@ class MultiDeadlineExecutor(BareExecutor):
 
     async def _readable(self, loop: AbstractEventLoop) -> None:
         """Let the event loop run until there is an arrival or a due time."""
-        from mddag_executor.executor.asyncio_loop import set_done  # with asyncio
         fd, event = self._spin_once_epoll().fileno(), loop.create_future()
         loop.add_reader(fd, set_done, event)
         left = self._rest_s(None, self._upkeep.rest_s())

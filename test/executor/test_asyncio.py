@@ -499,6 +499,36 @@ def test_without_coroutines_there_is_no_loop():
     subprocess.run([sys.executable, '-c', code], check=True, timeout=60)
 
 
+def test_a_task_of_a_program_s_own_loop_awaits_futures_of_rclpy(make_executor, make_node):
+    """The futures are of a service and of a task. A wait does not poll, and leaves no callback."""
+    node = make_node()
+    node.create_service(Trigger, 'asked', lambda _, response: response)
+    client = node.create_client(Trigger, 'asked')
+    executor = make_executor(nodes=[node])
+
+    async def fail():
+        raise ValueError('of a task')
+
+    async def main():
+        spinning = asyncio.ensure_future(executor.spin_async())
+        response = await asyncio.wait_for(client.call_async(Trigger.Request()), patience(15))
+        assert isinstance(response, Trigger.Response)
+        with pytest.raises(ValueError, match='of a task'):
+            await executor.create_task(fail)
+        loop, never, turns = asyncio.get_running_loop(), Future(), itertools.count()
+        turn = loop._run_once
+        loop._run_once = lambda: (next(turns), turn())
+        with pytest.raises(asyncio.TimeoutError):
+            await asyncio.wait_for(never, 0.3)
+        assert next(turns) < 50
+        assert not never._callbacks
+        spinning.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await spinning
+
+    asyncio.run(main())
+
+
 def test_spin_async_ends_as_spin_does(make_executor, ros_context):
     executor = make_executor()
 
