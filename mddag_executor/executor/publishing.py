@@ -11,8 +11,8 @@ the first executor is made.
 
 1.  *A callback in* ``Client.call`` lends its worker to a spare thread (``workers``).
 2.  *A publication on a trigger topic* is noted, so that its messages find their job
-    (``attribution``).  Those outside of callbacks are counted, because the middleware numbers them
-    as well.
+    (``attribution``).  Other messages on the topics of declared callbacks are counted, because the
+    middleware numbers them as well.
 3.  *Delivery within the process.*  A middleware that delivers within a process does so inside
     ``publish``: the message can be taken when that returns.  The publishing thread takes the
     message itself instead of waking a worker.  If a thread waits for events, the descriptors of
@@ -213,11 +213,8 @@ def _send(
         if work is None or work.entity.callback is None:
             _note_outside(
                 running.pool, publisher, state, '' if work is None else work.entity.name)
-    if topic is None and not state.is_tracked:
-        original(publisher, msg)
-        return None
     if topic is None:
-        return _send_counted(original, publisher, msg, state)
+        return _send_unnoted(original, publisher, msg, state)
     if work is not None and work.entity.awaiting is not None:
         engine.answers.note_published(work, state.topic, msg)
         origin = work.origin or work.answers
@@ -236,17 +233,25 @@ def _send_counted(
     """
     with state.lock:
         state.count += 1
+        state.is_tracked = True
         try:
             if engine is None:
                 original(publisher, msg)
                 return None
-            state.is_tracked = True
             publication: Publication = engine.attribution.publish(
                 original, publisher, msg, state, topic, origin)
             return publication
         except BaseException:
             state.count -= 1  # the middleware has not counted it
             raise
+
+
+def _send_unnoted(original: Any, publisher: Any, msg: Any, state: PublisherState) -> None:
+    """Publish a message that belongs to no job; it is counted if later ones may belong to one."""
+    if state.is_tracked or state.topic in _watching:
+        _send_counted(original, publisher, msg, state)
+    else:
+        original(publisher, msg)
 
 
 def _send_outside(
@@ -270,12 +275,7 @@ def _send_outside(
             if claim is None:
                 _note_outside(pool, publisher, state, '')
     if claim is None:
-        if watching is not None:  # a callback may publish with it later
-            state.is_tracked = True
-        if state.is_tracked:
-            _send_counted(original, publisher, msg, state)
-        else:
-            original(publisher, msg)
+        _send_unnoted(original, publisher, msg, state)
         return None, None
     claim.work.entity.publishes.add(state.topic)
     engine = claim.pool.engine
