@@ -214,7 +214,8 @@ def _send(
             _note_outside(
                 running.pool, publisher, state, '' if work is None else work.entity.name)
     if topic is None:
-        return _send_unnoted(original, publisher, msg, state)
+        _send_unnoted(original, publisher, msg, state)
+        return None
     if work is not None and work.entity.awaiting is not None:
         engine.answers.note_published(work, state.topic, msg)
         origin = work.origin or work.answers
