@@ -16,10 +16,11 @@ Theory of operation
     which the thread that checks it owns.  So two checks decide (``GilCheck``): at both of them,
     the thread waited for something else, and it has hardly computed in between.  One that polls
     for something, and sleeps in between, waits as well.
-5.  If the kernel does not show it (gVisor), or the address is not found (a C library that is not
-    the GNU one, an interpreter without GIL), every thread counts as waiting for something else.
-    Then only the time that it has computed decides.  A callback that got no CPU between two checks
-    shares the GIL with the callback that wants it; but none waits for ever.
+5.  If the kernel does not show it (gVisor, or a program with capabilities of its own), or the
+    address is not found (a C library that is not the GNU one, an interpreter without GIL), every
+    thread counts as waiting for something else.  Then only the time that it has computed decides.
+    A callback that got no CPU between two checks shares the GIL with the callback that wants it;
+    but none waits for ever.
 """
 
 from __future__ import annotations
@@ -82,10 +83,19 @@ def _first_argument(tid: int) -> int:
     return int(fields[1], 16) if fields else 0
 
 
+def _is_shown() -> bool:
+    """Return whether the kernel shows what threads of this process do."""
+    try:
+        with open('/proc/self/syscall', encoding='ascii') as file:
+            return bool(file.read())
+    except OSError:  # a process whose program has capabilities may not read it
+        return False
+
+
 @cache
 def _gil_address() -> int:
     """Return an address in the data about the GIL; 0: it is not known."""
-    if not os.path.exists('/proc/self/syscall'):
+    if not _is_shown():
         return 0
     ended: list[bool] = []
 
@@ -112,8 +122,8 @@ def _gil_address() -> int:
 
 def waits_for_else(tid: int) -> bool:
     """Return whether a thread of this process, by its native id, sleeps, but not for the GIL."""
-    address = _first_argument(tid)
-    return address >= 0 and abs(address - _gil_address()) >= GIL_BYTES
+    address, gil = _first_argument(tid), _gil_address()
+    return address >= 0 and (not gil or abs(address - gil) >= GIL_BYTES)
 
 
 def cpu_ns(ident: int) -> int:

@@ -3,11 +3,13 @@
 """What the tests of the executor share: executors that spin in a thread, nodes, a waitable."""
 
 import contextlib
+from functools import cache
 import os
 import threading
 import time
 
 from mddag_executor import MultiDeadlineExecutor
+from mddag_executor.executor import gil_check
 import pytest
 from rclpy.node import Node
 from rclpy.waitable import NumberOfEntities, Waitable
@@ -121,6 +123,14 @@ def make_node(ros_context):
     for node in nodes:
         with contextlib.suppress(Exception):
             node.destroy_node()
+
+
+@pytest.fixture
+def kernel_that_hides_threads(monkeypatch):
+    """Let the kernel show of no thread what it does, as in a sandbox (gVisor)."""
+    monkeypatch.setattr(gil_check, '_first_argument', lambda tid: 0)
+    monkeypatch.setattr(gil_check, '_is_shown', lambda: False)
+    monkeypatch.setattr(gil_check, '_gil_address', cache(gil_check._gil_address.__wrapped__))
 
 
 class Pulse(Waitable):

@@ -528,8 +528,12 @@ def test_goals_of_an_action_are_told_apart_by_their_callback():
     assert function_of_task([].append, ()) != function_of_task([].remove, ())
 
 
-def test_workers_that_wait_for_a_callback_do_not_keep_it_waiting(make_executor, make_node):
+@pytest.mark.parametrize('kernel', ['shows', 'hides'])
+def test_workers_that_wait_for_a_callback_do_not_keep_it_waiting(
+        make_executor, make_node, kernel, request):
     """It may own a lock: if all workers wait, it goes on without one, whatever else computes."""
+    if kernel == 'hides':
+        request.getfixturevalue('kernel_that_hides_threads')
     lending = Lending(make_executor, make_node, 2, lends='50s', waits='40s', other_waits='40s')
     lending.then = lending.leave.set
     of_program = threading.Thread(target=lending.compute)

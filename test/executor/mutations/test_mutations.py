@@ -167,7 +167,7 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('those_that_go_on_wait_for_ever', [(
         'executor/lending.py', 'elif work in self.rejoining and seen == (before[0], True):',
         'elif False:')], of(
-        'test_gil.py', 'test_workers_that_wait_for_a_callback_do_not_keep_it_waiting')),
+        'test_gil.py', 'test_workers_that_wait_for_a_callback_do_not_keep_it_waiting[shows]')),
     Case('what_bypasses_the_core_stays_unknown', [(
         'executor/engine.py', 'self._start_next(running.worker, since)', 'pass')],
         of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
