@@ -36,7 +36,7 @@ import time
 from typing import Any, Protocol
 
 from mddag_executor.executor.compat import QuickCallback
-from mddag_executor.executor.starters import forget_starter
+from mddag_executor.executor.starters import starting_for_all
 
 CLOSE_S = 2.0
 """How long cancelled tasks may take to end."""
@@ -268,8 +268,8 @@ class CallbackLoop(asyncio.SelectorEventLoop):
                 runs = threading.Event()
                 self.call_soon_threadsafe(runs.set)
                 thread = threading.Thread(target=self._run, name='mddag-asyncio', daemon=True)
-                forget_starter(thread)  # it runs tasks of other executions as well
-                thread.start()
+                with starting_for_all():
+                    thread.start()
                 self._thread = thread
                 runs.wait()
 

@@ -160,7 +160,7 @@ class PublisherState:
     """
 
     __slots__ = ('lock', 'topic', 'count', 'numbers', 'is_tracked', 'sending', 'address',
-                 'recorded_by')
+                 'recorded_by', '__weakref__')
 
     def __init__(self, topic: str) -> None:
         self.lock = threading.RLock()

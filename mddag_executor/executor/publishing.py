@@ -288,8 +288,7 @@ def _send_outside(
 def _note_outside(pool: Any, publisher: Any, state: PublisherState, by: str) -> None:
     outside = pool.outside
     if outside is not None:
-        with state.lock:
-            outside.note(publisher, state, by, pool.running and pool.engine.is_judging)
+        outside.note(publisher, state, by, pool.running and pool.engine.is_judging)
 
 
 def publish_as_executor(publisher: Publisher, msg: Any) -> None:

@@ -1,25 +1,34 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Code that a callback starts and that publishes for it: threads, tasks, parts of coroutines.
+Code that a callback starts and that publishes for it: threads, tasks, later parts of coroutines.
 
 Theory of operation
 -------------------
 1.  A callback may leave publishing to code that runs elsewhere: a task of asyncio, a function in a
-    pool of threads (``run_in_executor``, ``to_thread``, ``submit``), a thread or
+    ``ThreadPoolExecutor`` (``submit``, ``run_in_executor``, ``to_thread``), a thread or
     ``threading.Timer``, a task of an executor.  Until the execution of the callback has ended,
     such code works *on its behalf*: what it publishes belongs to the execution, as if the callback
-    had published it.  So a callback that awaits or joins such code publishes in time.
-2.  Who has started the code (its *starter*) is in a context variable, which asyncio passes on to
-    its tasks and to ``to_thread``; in the thread; or in the ``Work`` of the task.
-3.  When the execution has ended, it is decided what its job has not published.  A later message
-    belongs to no job: see ``outside``.
+    had published it.  So if the callback awaits or joins such code, the messages belong to its
+    job.
+2.  The execution that has started the code is its *starter*.  It is noted when the code starts:
+
+    * of a thread, in the thread (``Thread.start``);
+    * of a function in a pool, and of what asyncio runs, in a context variable.  Asyncio passes it
+      on to its tasks and to ``to_thread``;
+    * of a task of an executor, in its ``Work``.
+
+    Code that such code starts has the same starter.  The threads of a pool, and the thread of the
+    event loop, run code of several executions, so they have no starter themselves.
+3.  When the execution has ended, it is decided what its job has not published.  A message that is
+    published later belongs to no job: see ``outside``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 import contextvars
 from functools import wraps
 import threading
@@ -33,9 +42,10 @@ _ATTRIBUTE = '_mddag_starter'
 
 class Claim(NamedTuple):
     """
-    What a starter publishes.
+    The execution that a message belongs to which other code publishes.
 
-    :ivar work: the execution (``Work``), which runs in ``pool``; ``origin``: its job.
+    :ivar work: the execution (``Work``), which runs in ``pool`` (a ``WorkerPool``).
+    :ivar origin: its job.
     """
 
     work: Any
@@ -58,7 +68,7 @@ class Starter:
         self._pool = weakref.ref(pool)
 
     def claim(self, topic: str, message: Any) -> Claim | None:
-        """Let the execution publish a message; None: it has ended, or has no job."""
+        """Return the execution, which publishes a message; None: it has ended, or has no job."""
         work, pool = self._work(), self._pool()
         if work is None or pool is None or pool.is_inside():
             return None
@@ -79,11 +89,12 @@ _starter: contextvars.ContextVar[Starter | None] = contextvars.ContextVar(
     'mddag_starter', default=None)
 
 
-class _Submitting(threading.local):
-    is_submitting = False
+class _Starting(threading.local):
+    is_for_all = False
 
 
-_calling = _Submitting()
+_starting = _Starting()
+"""Whether a thread that the calling one starts runs code of several executions."""
 
 
 def starter_outside() -> Starter | None:
@@ -95,14 +106,19 @@ def starter_outside() -> Starter | None:
 
 
 def set_starter(context: contextvars.Context, starter: Starter | None) -> None:
-    """Let what runs in a context work on behalf of an execution; None: leave it as it is."""
+    """Let code that runs in a context work on behalf of an execution; None: change nothing."""
     if starter is not None:
         context.run(_starter.set, starter)
 
 
-def forget_starter(thread: threading.Thread) -> None:
-    """Let a thread that has just been made work on behalf of no execution."""
-    thread.__dict__.pop(_ATTRIBUTE, None)
+@contextmanager
+def starting_for_all() -> Iterator[None]:
+    """Let threads that are started while entered work on behalf of no execution."""
+    before, _starting.is_for_all = _starting.is_for_all, True
+    try:
+        yield
+    finally:
+        _starting.is_for_all = before
 
 
 def run_for(
@@ -122,17 +138,15 @@ def install(starter_here: Callable[[], Starter | None]) -> None:
 
     :param starter_here: returns the starter of what the calling thread starts.
     """
-    make: Any = threading.Thread.__init__
+    start: Any = threading.Thread.start
     submit: Any = ThreadPoolExecutor.submit
 
-    @wraps(make)
-    def make_thread(self: threading.Thread, *args: Any, **kwargs: Any) -> None:
-        make(self, *args, **kwargs)
-        # a thread of a pool also runs functions that others submit; a dummy is the calling thread
-        if not _calling.is_submitting and type(self).__name__ != '_DummyThread':
-            starter = starter_here()
-            if starter is not None:
-                self.__dict__[_ATTRIBUTE] = starter
+    @wraps(start)
+    def start_thread(self: threading.Thread) -> None:
+        starter = None if _starting.is_for_all else starter_here()
+        if starter is not None:
+            self.__dict__[_ATTRIBUTE] = starter
+        start(self)
 
     @wraps(submit)
     def submit_with_starter(
@@ -141,11 +155,8 @@ def install(starter_here: Callable[[], Starter | None]) -> None:
         starter = starter_here()
         if starter is None:
             return submit(self, function, *args, **kwargs)
-        before, _calling.is_submitting = _calling.is_submitting, True
-        try:
+        with starting_for_all():  # its threads also run functions that others submit
             return submit(self, run_for, starter, function, *args, **kwargs)
-        finally:
-            _calling.is_submitting = before
 
-    threading.Thread.__init__ = make_thread  # type: ignore[method-assign]
+    threading.Thread.start = start_thread  # type: ignore[method-assign]
     ThreadPoolExecutor.submit = submit_with_starter  # type: ignore[assignment,method-assign]

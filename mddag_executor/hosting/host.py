@@ -60,6 +60,7 @@ import time
 from typing import Any, NoReturn, TypeVar
 import weakref
 
+from mddag_executor.executor import publishing
 from mddag_executor.executor.compat import alive, executor_kept
 from mddag_executor.executor.interrupts import handler_of
 from mddag_executor.executor.registry import snapshot
@@ -138,6 +139,7 @@ class Host:
         self._process = os.getpid()
 
     def __enter__(self) -> Host:
+        publishing.install()  # it outlasts the run, unlike what is replaced below
         context = self.context = rclpy.utilities.get_default_context()
         replace = self._replacements.replace
         self._replacements.callback(_return_to, os.getcwd())

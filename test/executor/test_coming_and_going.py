@@ -194,6 +194,9 @@ class Brief:
         made += [weakref.ref(thing) for thing in (self, *self.nodes, *entities)]
         for node in self.nodes:
             executor.add_node(node)
+        thread = threading.Thread(target=self._tick)    # of the program's own
+        thread.start()
+        thread.join()
 
     def _tick(self):
         with suppress(InvalidHandle):  # destroyed while it runs

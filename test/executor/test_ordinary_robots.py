@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from functools import partial
 from itertools import count
 from random import Random
+import threading
 import time
 
 from mddag_executor import replay, reschedule
@@ -235,6 +236,15 @@ class Fusion:
         self.ran[what].append((int(message.frame_id), -1 if job is None else job.job))
 
 
+class Leaving(Fusion):
+    """A thread publishes what is fused, and the callback waits for it."""
+
+    def fuse(self, message):
+        thread = threading.Thread(target=super().fuse, args=(message,))
+        thread.start()
+        thread.join()
+
+
 class Pairing(Fusion):
     """
     Fuses each fourth boxes with the last scan but one, though the last one waits too.
@@ -281,7 +291,8 @@ def run_fusion(make_executor, make_node, graph, path, kind=Fusion):
     with Spinning(executor):
         # on a busy machine few boxes come, and from few results a draft concludes nothing
         assert wait_for(lambda: len(robot.ran['obstacles']) > 2 * LEAST_COPIED and any(
-            n >= 24 and (n % 3 == 0 or kind is not Fusion) for n, _ in robot.ran['obstacles']))
+            n >= 24 and (n % 3 == 0 or kind not in (Fusion, Leaving))
+            for n, _ in robot.ran['obstacles']))
         for timer in robot.timers:
             timer.cancel()
         assert wait_for(lambda: is_idle(executor))
@@ -289,10 +300,11 @@ def run_fusion(make_executor, make_node, graph, path, kind=Fusion):
     return robot, executor.statistics()
 
 
-def test_a_sync_of_two_rates(make_executor, make_node, tmp_path):
+@pytest.mark.parametrize('kind', [Fusion, Leaving])
+def test_a_sync_of_two_rates(make_executor, make_node, tmp_path, kind):
     """A result belongs to the scan whichever topic's callback makes it, and is judged once."""
     path = tmp_path / 'run.mcap'
-    robot, statistics = run_fusion(make_executor, make_node, loads(FUSED), path)
+    robot, statistics = run_fusion(make_executor, make_node, loads(FUSED), path, kind)
     scans = statistics['dags']['lidar']['jobs']
     assert all(n == job for each in robot.ran.values() for n, job in each) or scans > max(
         n for n, _ in robot.ran['obstacles']) + 1     # a skipped release, on a busy machine

@@ -54,7 +54,9 @@ class Detector:
         self.executor = make_executor(
             self.task_set, num_workers=4, nodes=[self.node, brake], **more)
         self.watch = Watch(self.executor, self.task_set)
-        self.ended, self.stopped, self.kept = [], [], []
+        self.ended, self.stopped, self.kept, self.messages = [], [], [], []
+        self.threads = [threading.Thread(target=lambda: self.alarm(self.messages[-1]))
+                        for _ in range(IMAGES)]
         self.may_go_on = threading.Event()
         self.pool = ThreadPoolExecutor(1)
 
@@ -177,6 +179,13 @@ def a_thread_of_a_thread(each, message):
     thread.join()
 
 
+def a_thread_that_was_made_before(each, message):
+    thread = each.threads.pop()
+    each.messages.append(message)
+    thread.start()
+    thread.join()
+
+
 def a_timer_of_threading(each, message):
     timer = threading.Timer(0.001, each.alarm, (message,))
     timer.start()
@@ -201,8 +210,8 @@ def a_loop_over_a_generator(each, message):
 IN_TIME = [
     in_a_later_piece, after_a_sleep_of_asyncio, run_in_executor, to_thread, a_task_of_asyncio,
     a_thread_of_a_task_of_asyncio, a_task, a_task_of_a_task, a_done_callback_of_a_future, a_thread,
-    a_thread_of_a_thread, a_timer_of_threading, a_pool_of_threads, a_map_over_threads,
-    a_loop_over_a_generator]
+    a_thread_of_a_thread, a_thread_that_was_made_before, a_timer_of_threading, a_pool_of_threads,
+    a_map_over_threads, a_loop_over_a_generator]
 
 
 @pytest.mark.parametrize('publish', IN_TIME)
@@ -373,3 +382,63 @@ def test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it(make_execu
     thread.join()
     assert 'threads of its own' in found.text
     assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
+
+
+def test_a_thread_of_asyncio_works_for_no_execution_that_has_only_started_it(
+        make_executor, make_node):
+    """Others schedule functions as well, while the execution still runs."""
+    has_made, has_published = threading.Semaphore(0), threading.Semaphore(0)
+
+    async def publish(each, message):
+        await asyncio.sleep(0.001)
+        each.kept.append((asyncio.get_running_loop(), message))
+        has_made.release()
+        assert await asyncio.to_thread(has_published.acquire, timeout=60.0)
+
+    def schedule():
+        for _ in range(IMAGES // 2):
+            assert has_made.acquire(timeout=60.0)
+            loop, message = each.kept.pop()
+            loop.call_soon_threadsafe(each.alarm, message)
+            loop.call_soon_threadsafe(has_published.release)
+
+    each = Detector(make_executor, make_node, publish)
+    thread = threading.Thread(target=schedule)
+    thread.start()
+    found, = each.run()
+    thread.join()
+    assert 'threads of its own' in found.text
+    assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
+
+
+def observed(watch, executor):
+    """Return how many messages the line about messages from outside counts; None: no line."""
+    return next((each.observed for each in watch.drift(executor.statistics())
+                 if each.kind == 'published outside'), None)
+
+
+def test_messages_before_the_run_are_counted_and_no_warning(make_executor, make_node, capfd):
+    """A watch that begins again does not count those of before."""
+    each = Detector(make_executor, make_node, Detector.alarm)
+    each.alarm(Header(frame_id='0'))
+    assert observed(each.watch, each.executor) == 1
+    each.watch.restart()
+    assert observed(each.watch, each.executor) is None
+    for publisher in (each.publisher, each.node.create_publisher(Header, '/alarm', 10)):
+        publisher.publish(Header(frame_id='0'))
+    assert observed(each.watch, each.executor) == 2
+    assert 'published' not in capfd.readouterr().err
+
+
+def test_messages_are_counted_from_the_first_one_though_the_node_is_added_later(
+        make_executor, make_node):
+    each = Detector(make_executor, make_node, Detector.alarm)
+    later = make_executor(each.task_set)
+    watch = Watch(later, each.task_set)
+    for _ in range(3):
+        each.alarm(Header(frame_id='0'))
+    assert observed(watch, later) is None
+    each.executor.remove_node(each.node)
+    later.add_node(each.node)
+    each.alarm(Header(frame_id='0'))
+    assert observed(watch, later) == 4

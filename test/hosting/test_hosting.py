@@ -16,6 +16,7 @@ import time
 
 from mddag_executor import MultiDeadlineExecutor, open_recording
 from mddag_executor.defaults import SAME_SIGNAL_S
+from mddag_executor.executor import publishing
 from mddag_executor.executor.session import Session
 from mddag_executor.hosting.guest import Guest
 from mddag_executor.hosting.host import Host
@@ -527,6 +528,7 @@ def test_rclpy_is_as_before_when_the_host_is_left(default_context):
             rclpy.experimental.EventsExecutor, Executor.__init__, threading.Thread.start,
             {*vars(context)}]
 
+    publishing.install()
     before = parts()
     with Host() as host:
         host.start(SingleThreadedExecutor(), [Program('main', 'main', main)])

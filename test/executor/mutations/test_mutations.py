@@ -319,11 +319,11 @@ awaiting.named(
         'test_the_stamp_of_a_result_says_which_of_several_messages_was_used')),
     Case('executions_that_publish_nothing_answer', [(
         'executor/answers.py', ' and awaiting.is_answer(work.published)', '')], of(
-        'test_ordinary_robots.py', 'test_a_sync_of_two_rates',
+        'test_ordinary_robots.py', 'test_a_sync_of_two_rates[Fusion]',
         'test_the_stamp_of_a_result_says_which_of_several_messages_was_used')),
     Case('messages_without_a_job_answer_nothing', [(
         'executor/answers.py', 'awaiting.newest(self._is_open) or NO_ORIGIN', 'NO_ORIGIN')], of(
-        'test_ordinary_robots.py', 'test_a_sync_of_two_rates',
+        'test_ordinary_robots.py', 'test_a_sync_of_two_rates[Fusion]',
         'test_the_stamp_of_a_result_says_which_of_several_messages_was_used')),
     # --- bypass.py
     Case('the_bypass_runs_the_last_one_first', [(
