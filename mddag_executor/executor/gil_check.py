@@ -179,6 +179,8 @@ class GilCheck:
         """
         Return whether the thread waits for anything but the GIL, as it did at the last check.
 
+        The thread must not end meanwhile.
+
         :param ident: the thread's id in Python; ``tid``: its native id.
         :param now: monotonic ns.
         """

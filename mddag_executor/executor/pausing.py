@@ -34,7 +34,7 @@ from types import CodeType, FrameType
 from typing import Any, Protocol
 
 import mddag_executor
-from mddag_executor.executor.gil_check import GilCheck
+from mddag_executor.executor.gil_check import GilCheck, LAST_CHECK_NS
 import rclpy
 
 PAUSES_BY_S = 0.001
@@ -104,20 +104,23 @@ class Pauses:
         """Return whether a paused thread checks the execution that holds the GIL."""
         return any(pause.is_watching for pause in self.paused.values())
 
-    def overtaker(self) -> tuple[Any, Any]:
-        """Return the execution that holds the GIL, and its thread; without the lock."""
-        pool = self._pool
-        with pool.lock:
-            holder = pool.engine.interpreter.holder
-            return holder, None if holder is None else pool.thread_of(holder)
+    def check(self, check: GilCheck) -> None:
+        """
+        Take the GIL from the execution that holds it, if that does not compute; without the lock.
 
-    def overtaker_waits(self, urgent: Any) -> None:
-        """Take the GIL from an execution that does not compute; without the lock."""
+        The lock is locked meanwhile, so the thread that is checked does not end.
+        """
         pool = self._pool
         with pool.lock:
-            pool.tick()
-            if pool.engine.interpreter.holder is urgent:
-                pool.engine.stop_holding(urgent)
+            now = pool.tick() - pool.offset
+            holder = pool.engine.interpreter.holder
+            thread = None if holder is None else pool.thread_of(holder)
+            if thread is None:
+                return
+            if check.subject is not holder:
+                check.begin(holder, now, LAST_CHECK_NS, LAST_CHECK_NS)
+            if check.waits(thread.ident, thread.vtid, now):  # it may need a lock of the paused one
+                pool.engine.stop_holding(holder)
                 self.end()
                 pool.wake_for_more()
 
@@ -173,15 +176,10 @@ class Pause:
                 measurement.resume()
 
     def _wait(self) -> None:
-        """Wait for ``end``, which is called too when what holds the GIL does not compute."""
-        pauses = self._thread.pool.pauses
-        check, work = GilCheck(), None
+        """Wait for ``end``, which a check also calls if what holds the GIL does not compute."""
+        pauses, check = self._thread.pool.pauses, GilCheck()
         while True:
-            before, (work, urgent) = work, pauses.overtaker()
-            if work is not before:
-                check = GilCheck()
-            if urgent is not None and check.waits(urgent.ident, urgent.vtid, monotonic_ns()):
-                pauses.overtaker_waits(work)  # it may need a lock of this one
+            pauses.check(check)
             if self._may_go_on.acquire(timeout=CHECK_S):
                 return
 

@@ -103,7 +103,11 @@ class SentRequests:
         :param kind: ``goal``, ``cancel`` or ``result``; ``goal``: the id of the goal.
         """
         self._note((kind, goal), heritage)
-        number = send()
+        try:
+            number = send()
+        except BaseException:
+            self._notes.pop((kind, goal), None)
+            raise
         self._note((client, kind, number), heritage, (kind, goal))
         self._receive(ACTION)
         return number

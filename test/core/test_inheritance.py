@@ -137,7 +137,9 @@ def test_a_less_urgent_sender_changes_nothing():
     other, request = (core.ready_undeclared(0, -1, 0, core.new_queue(), time) for time in (1, 2))
     core.inherit(request, *core.heritage(source))
     core.complete(source, 3)
-    assert started(core, 3, 2) == [other, request]
+    assert started(core, 3, 1) == [other]
+    assert core.take(0, 3) == request
+    assert core.heritage(request) is None   # its own requests have the default deadline as well
 
 
 def test_requests_of_a_service_keep_their_order():

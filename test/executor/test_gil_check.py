@@ -15,7 +15,7 @@ import time
 
 from mddag_executor.executor import gil_check
 from mddag_executor.executor.gil import short_switch_interval
-from mddag_executor.executor.gil_check import GilCheck, waits_for_else
+from mddag_executor.executor.gil_check import CHECK_NS, GilCheck, LAST_CHECK_NS, waits_for_else
 import pytest
 
 from .conftest import wait_for
@@ -132,6 +132,23 @@ def answers(thread, number=50, step_us=200):
         keeps_gil.usleep(step_us)
         time.sleep(0)
     return found
+
+
+def test_what_is_more_urgent_is_not_kept_waiting_by_the_checks_of_before():
+    """And between two checks is never more than the longest interval."""
+    me, check, subject = threading.current_thread(), GilCheck(), object()
+    check.begin(subject, 0, LAST_CHECK_NS, LAST_CHECK_NS)
+    later = check.at
+    check.begin(subject, 0, CHECK_NS, CHECK_NS)
+    assert check.at == CHECK_NS < later
+    check.begin(subject, 0, LAST_CHECK_NS, LAST_CHECK_NS)
+    assert check.at == CHECK_NS
+    gaps = []
+    for _ in range(10):
+        now = check.at
+        check.waits(me.ident, me.native_id, now)
+        gaps.append(check.at - now)
+    assert gaps == sorted(gaps) and gaps[-1] == LAST_CHECK_NS
 
 
 @pytest.mark.parametrize('processes', [0, 4])

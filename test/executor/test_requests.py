@@ -11,6 +11,7 @@ from mddag_executor.core import NEVER, Tables
 from mddag_executor.executor import compat
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.kinds import ListenerEntity
+from mddag_executor.executor.request_ids import sender_of
 from mddag_executor.executor.sent_requests import SentRequests
 from mddag_executor.sources.open import open_recording
 from mddag_executor.whatif.load import LoadBuilder
@@ -217,6 +218,41 @@ def test_a_request_that_is_taken_before_it_is_noted_is_forgotten_with_its_respon
     assert found == [(5, 0)] and not requests.is_empty()
     assert requests.of_response('handle', 7) == (5, 0)
     assert requests.is_empty()
+
+
+def test_an_older_request_is_not_the_one_that_is_just_being_sent():
+    """An ordinary one of the same client, which was taken late, inherits nothing."""
+    requests, found = SentRequests(), []
+    before = time.time_ns() - 1_000_000
+
+    def send():
+        found.append(requests.of_request(b'client', 6, before))
+        return 7
+
+    requests.send(send, b'client', '/ask', 'handle', (5, 0))
+    assert found == [None]
+    assert requests.of_request(b'client', 7, time.time_ns()) == (5, 0)
+
+
+@pytest.mark.parametrize('send', [
+    lambda requests, fails: requests.send(fails, b'client', '/ask', 'handle', (5, 0)),
+    lambda requests, fails: requests.send_to_action(fails, 'goal', b'goal', 'handle', (5, 0))],
+    ids=['service', 'action'])
+def test_a_request_that_cannot_be_sent_is_forgotten(send):
+    def fails():
+        raise InvalidHandle('its client was destroyed')
+
+    requests = SentRequests()
+    with pytest.raises(InvalidHandle):
+        send(requests, fails)
+    assert requests.is_empty()
+
+
+def test_the_client_of_a_header_is_unknown_if_the_rest_in_memory_does_not_agree():
+    """As of a header that is laid out in another way than rclpy's."""
+    header = SimpleNamespace(
+        source_timestamp=1, received_timestamp=2, request_id=SimpleNamespace(sequence_number=3))
+    assert sender_of(header) is None
 
 
 def test_a_response_that_comes_before_its_request_is_noted_is_as_urgent(make_executor):
