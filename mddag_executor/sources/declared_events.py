@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mddag_executor.recording.columns import concatenate, Ints, rows, Table
-from mddag_executor.recording.joins import equal, equal_pairs, sort_by
+from mddag_executor.recording.joins import equal, equal_pairs, last_of, sort_by
 from mddag_executor.sources.imported_events import START
 from msg_graph import TaskSet
 import numpy as np
@@ -90,17 +90,21 @@ class DeclaredEvents:
         events['d'][row[last]] = 2 * (completed['cpu_time'][of] + 1) + (
             completed['held_interpreter'][of] != 0)
         failed = failed[self._known(failed)]
-        # the failed one is completed next
-        order = sort_by(completed['place'])
-        found = []
-        for key, place in zip(self._key(failed).tolist(), failed['place'].tolist()):
-            at = order[np.searchsorted(completed['place'][order], place):]
-            next_one = at[self._key(completed[at]) == key][:1]
-            mine = np.flatnonzero(
-                (self._key(dispatched) == key)
-                & np.isin(dispatched['callback'], completed['callback'][next_one]))
-            found += dispatched['place'][mine[-1:]].tolist()
-        return np.array(found, dtype=np.int64)
+        next_one = self._next(failed, completed)
+        found = which[next_one[next_one >= 0]]
+        places: Ints = dispatched['place'][backwards[found[found >= 0]]]
+        return places
+
+    def _next(self, failed: Table, completed: Table) -> Ints:
+        """Return by failure the next completion of its vertex and job in the file; -1: none."""
+        key = np.append(self._key(completed), self._key(failed))
+        backwards = -np.append(completed['place'], failed['place'])
+        is_end = np.arange(len(key)) < len(completed)
+        order = sort_by(key, backwards)
+        last = last_of(is_end[order], key[order])
+        found = np.empty(len(key), dtype=np.int64)
+        found[order] = np.where(last >= 0, order[last], -1)
+        return found[len(completed):]
 
     def _known(self, events: Table) -> Any:
         """Return which events are of declared vertices."""
