@@ -72,10 +72,9 @@ class Interpreter:
     def patience(self) -> int:
         """Return how long what is ready may wait for a callback that was expected to end, ns."""
         state = self._state
-        if not state.ready:
-            return self._patience[-1]
+        x = first_waiting(state)
         # that of the vertex whose deadline it has or inherits; -1: the default one, which is last
-        return self._patience[state.x_like[first_of(state, state.ready[0])]]
+        return self._patience[-1 if x < 0 else state.x_like[x]]
 
     def may_be_overtaken(self, now: int) -> bool:
         """Return whether the first waiting execution may overtake the latest holder."""

@@ -609,6 +609,24 @@ def test_what_is_urgent_waits_less_for_a_callback_that_was_expected_to_end(deadl
     assert check.at == 2 * MS + engine.interpreter.patience() // 2
 
 
+def test_what_is_urgent_waits_no_longer_because_it_needs_the_interpreter():
+    """It is not overtaken by a callback that is expected to end soon; that one may wait."""
+    task_set = loads(graph(n='''
+        name: a, subscription: /a, period: 1s, deadline: 33ms, holds_interpreter: true
+        name: b, subscription: /b, period: 1s, deadline: 1s, holds_interpreter: true'''))
+    engine = new_engine(task_set, workers=2)
+    urgent, holder = (entity_of(engine, task_set, dag, 0) for dag in range(2))
+    for entity in (urgent, holder):
+        entity.habit = GilHabit(True)
+        entity.habit.mean_ns = MS // 2
+    engine.arrived(Work(holder, print), None, 0, -1, 0)
+    assert engine.step(0, 0).work is not None
+    engine.arrived(Work(urgent, print), None, 0, -1, 0)
+    before = engine.interpreter.patience()
+    assert engine.step(1, 0).work is None
+    assert engine.interpreter.patience() == before == MS
+
+
 def test_the_successor_of_a_callback_that_waits_starts_within_a_millisecond():
     """A thread looks, and checks once more whether that callback computes."""
     task_set = loads(graph(n='name: a, subscription: /a, period: 1s, deadline: 20ms'))
