@@ -167,6 +167,21 @@ def test_an_urgent_request_comes_to_a_late_queue():
     assert started(core, now, 5) == [*late, request, third]
 
 
+def test_a_late_queue_stays_late_when_an_inherited_deadline_is_over():
+    core = new_core(default=10 * TICK)
+    queue, now = core.new_queue(), 11 * TICK
+    late = core.ready_undeclared(0, -1, 0, queue, 0)
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), now)
+    assert core.take(0, now) == other
+    request = core.ready_undeclared(0, -1, 0, queue, now)
+    core.inherit(request, now + 2 * TICK, 0)
+    core.complete(other, now)
+    assert started(core, now, 1) == [late]
+    now += 3 * TICK     # with its own deadline, the request would be in time
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), now)
+    assert started(core, now, 2) == [other, request]
+
+
 @pytest.mark.parametrize('suspends', [False, True])
 def test_what_is_over_is_not_inherited_any_more(suspends):
     """A late job takes nothing down by its requests; they are like any other then."""

@@ -176,6 +176,33 @@ def test_one_that_goes_on_may_leave_its_outer_group():
     assert core.take(0, 4) == y
 
 
+def test_several_that_go_on_in_a_closed_group_do_so_one_after_the_other():
+    """Though a fresh execution, which may not start there, waits before them."""
+    core = Scheduler(Tables.build(
+        None, legs=True, default_deadline=100, max_active_jobs=4, expire_after=1000), 2, 'rad')
+    outer = core.new_outer_group()
+    several = [core.ready_undeclared(0, -1, 0, core.new_queue(), now) for now in range(3)]
+    for x in several:
+        core.state.x_outer[x] = outer
+    first, second, fresh = several
+    core.open_outer(outer, 1)
+    for x in (first, second):
+        assert core.take(0, 3) == x
+        core.lend(x)
+    core.open_outer(outer, 0)
+    core.rejoin(first, 0, 0, 4)
+    core.rejoin(second, 0, 0, 5)
+    assert core.take(0, 6) == first
+    assert core.take(1, 6) == -1
+    core.complete(first, 7)
+    assert [*broken_in_core(core.tables, core.state)] == []
+    assert core.take(0, 7) == second
+    core.complete(second, 8)
+    assert core.take(0, 8) == -1
+    core.open_outer(outer, 1)
+    assert core.take(0, 9) == fresh
+
+
 def test_the_number_of_a_freed_outer_group_is_used_again_when_none_of_it_is_left():
     core = Scheduler(Tables.build(
         None, legs=True, default_deadline=100, max_active_jobs=4, expire_after=1000), 2, 'rad')

@@ -533,6 +533,33 @@ def test_what_waits_for_a_callback_group_urges_its_owner(is_late):
     check(engine)
 
 
+def test_the_owner_of_a_callback_group_is_urged_after_it_has_awaited_something_as_well():
+    """Else it waits for a worker behind all that is less urgent than what it holds up."""
+    task_set = loads(graph(
+        n='name: fast, timer: 20ms, deadline: 20ms',
+        m='name: between, timer: 100ms, deadline: 50ms'))
+    engine = new_engine(task_set, 1, default_deadline=100 * MS)
+    fast, between = (entity_of(engine, task_set, dag, 0) for dag in range(2))
+    slow = new_entity()
+    slow.group = fast.group = engine.scheduler.new_group()
+    owner = Work(slow, print)
+    engine.ready(owner, 0)
+    assert engine.step(0, 0).work is owner
+    engine.suspended(owner, 0, MS, 0, 0)
+    works = [Work(each, print) for each in (fast, between)]
+    for work in works:
+        engine.timer_due(work, MS, MS)
+    assert engine.step(0, MS).work is works[1]
+    check(engine)
+    engine.timer_due(Work(between, print), 2 * MS, 2 * MS)
+    engine.resume(owner, 3 * MS)
+    engine.finished(works[1], MS, 4 * MS, 4 * MS, 0, 0)
+    assert engine.step(0, 4 * MS).work is owner
+    engine.finished(owner, 4 * MS, 5 * MS, 5 * MS, 0, 0)
+    assert engine.step(0, 5 * MS).work is works[0]
+    check(engine)
+
+
 @examples(150)
 @given(st.lists(st.booleans() | st.integers(0, 2), max_size=120))
 def test_nothing_waits_that_may_run_during_a_computing_callback(steps):
