@@ -638,9 +638,9 @@ def test_what_is_urgent_waits_less_for_a_callback_that_was_expected_to_end(deadl
 
 def test_what_is_urgent_waits_no_longer_because_it_needs_the_interpreter():
     """It is not overtaken by a callback that is expected to end soon; that one may wait."""
-    task_set = loads(graph(n='''
+    task_set = loads(graph(n="""
         name: a, subscription: /a, period: 1s, deadline: 33ms, holds_interpreter: true
-        name: b, subscription: /b, period: 1s, deadline: 1s, holds_interpreter: true'''))
+        name: b, subscription: /b, period: 1s, deadline: 1s, holds_interpreter: true"""))
     engine = new_engine(task_set, workers=2)
     urgent, holder = (entity_of(engine, task_set, dag, 0) for dag in range(2))
     for entity in (urgent, holder):
