@@ -5,14 +5,14 @@ What requests inherit from the executions that send them: rule 15 of the schedul
 
 Theory of operation
 -------------------
-An undeclared execution has a key of its own: ready time plus default deadline.  If it *inherits*
-(``State.x_like`` is not -1), its priority is that of the execution that waits for it, or may.  The
-slot of the execution then counts as released one default deadline before that priority, so that
-the check of late work (``overload``) comes when it is over.  ``State.job_ready`` keeps when the
-execution became ready.
+An undeclared execution has a priority of its own: its ready time plus the default deadline.  If it
+*inherits* (``State.x_like`` is not -1), it has the priority of the execution that has sent the
+request, and that may wait for the response.  Its slot then counts as released one default deadline
+before that priority, so that the check of late work (``overload``) comes when the priority is
+over.  ``State.job_ready`` keeps the time at which the execution became ready.
 
-Executions of a queue keep their order.  So those before one that inherits have its priority as
-well: none of them may hold it up.  ``State.job_inherited`` keeps what each one inherits itself.
+Executions of a queue keep their order.  If one of them inherits, those before it have its priority
+as well, because it waits for them.  ``State.job_inherited`` keeps what each one inherits itself.
 
 Like ``rules`` this module contains only integer arithmetic, list indexing and ``heapq``.
 """

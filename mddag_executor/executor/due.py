@@ -9,12 +9,12 @@ Theory of operation
     While a thread waits in the epoll, its timerfd (``EventLoop.timer``) is set to the first one.
     While there are executions to run, it may expire too early, but not too late.
 2.  *Looks.*  Waking a thread costs 60 to 140 us while a callback computes, so no thread waits for
-    events then.  A parked thread *looks* instead, at the latest time at which anything that may
-    have come would have to start (``Parking.watch``).  A callback that is known to wait has to
-    start at once.  One that computes may wait for a part of its relative deadline
-    (``LOOK_PART``).  Of timers it is known when they are due; messages of other processes may
-    come at any time.  A callback that ends before the look costs no wake-up: the time is set
-    again by the next one, unless it is good enough.
+    events then.  Instead, a parked thread *looks* for events (``Parking.watch``), at the latest
+    time at which anything that may have come would have to start.  A callback that is known to
+    wait has to start at once.  One that computes may wait for a part of its relative deadline
+    (``LOOK_PART``).  The times at which timers are due are known, but messages of other processes
+    may come at any time.  If a callback ends before the look, no thread is woken: the next
+    callback puts the look off, unless its time is good enough.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 """
 Whether the execution that holds the interpreter computes, while something waits for it.
 
-If it waits for anything else, it gives the interpreter up (``gil``, 4).  A paused thread
-checks this itself (``pausing``), so no other thread does meanwhile.
+An execution that waits for anything else gives the interpreter up (``gil``, 4).  While a thread
+is paused, that thread checks the execution (``pausing``), and no other one does.
 """
 
 from __future__ import annotations

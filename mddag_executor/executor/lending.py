@@ -5,14 +5,17 @@ Callbacks that wait inside ``Client.call``: they lend their workers, and rejoin.
 
 Theory of operation
 -------------------
-A callback that waits inside ``Client.call`` returns its worker to the core.  If fewer threads are
-left than there are workers, a thread is made.  At most ``MOST`` callbacks lend at the same time;
-further ones keep their workers.  When it has its answer, it *rejoins*: it waits in the core like
-any other execution, and its thread waits for its permit.  The thread that dispatches it hands its
-worker over, and chooses again.  All workers may run callbacks that wait for this one (it may own a
-lock).  So it goes on without a worker if all running callbacks wait for something (``GilCheck``),
-and none has ended, at two checks in a row; as it does when a spin ends, or in ``spin_once``, where
-only one callback runs.  Other threads of the program may compute meanwhile: they need no worker.
+1.  *Lending.*  A callback that waits inside ``Client.call`` returns its worker to the core.  If
+    there are fewer other threads than workers, a thread is made.  At most ``MOST`` callbacks lend
+    at the same time; further ones keep their workers.
+2.  *Rejoining.*  When the callback has its answer, its execution waits in the core like any other
+    one, and its thread waits for its *permit*.  The thread that dispatches the execution gives the
+    worker to that thread, releases the permit, and chooses again.
+3.  *Going on without a worker.*  All workers may run callbacks that wait for this one, for example
+    for a lock that it owns.  So it goes on without a worker if all running callbacks wait for
+    something (``GilCheck``) at two checks in a row, and no callback has ended between the two.
+    Other threads of the program may compute meanwhile: they need no worker.  A callback also goes
+    on without a worker when a spin ends, and in ``spin_once``, where only one callback runs.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ Theory of operation
 -------------------
 1.  A message belongs to a job if an execution of the job published it, or code that works on its
     behalf (``starters``).  A message that a thread, a task or an undeclared callback publishes
-    otherwise belongs to no job.  The job counts as without it, although the node has published.
+    otherwise belongs to no job.  The job is judged as if the node had not published it.
 2.  Such messages are counted by publisher, and by the code that publishes.  Drift reports them at
     the end of the run (``msg_graph.drift``, rule 6), and a recorded run has them.
 3.  If a callback may publish the topic (``may_publish``), results are not due without the message,

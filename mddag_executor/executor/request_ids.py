@@ -1,18 +1,22 @@
 # Copyright 2026 The mddag_executor developers
 # SPDX-License-Identifier: Apache-2.0
 """
-Which client has sent a request: the middleware's id of a client, and the one in a request.
+Which client has sent a request: the id of a client, and the id in the header of a request.
 
-Neither rclpy nor rmw show these, so they are read where they are in memory.  Each is checked
-against what is shown; if it does not agree, the id is unknown, and the request inherits nothing.
+The middleware gives each client an id, and writes it into the requests of the client.  rclpy and
+rmw do not show both of these ids, so they are read where they are in memory.  The memory next to
+each is compared with values that rclpy or rmw show.  If these differ, the id is unknown, and the
+request inherits nothing.
 
-* The id in a request is in its header (``rmw_service_info_t``), the C++ object behind the head of
-  a Python object of pybind11.  Its other fields must be those that rclpy shows.
-* A client of Fast DDS writes the id of the reader for its responses into its requests.  In Kilted
-  rmw shows that id.  In Jazzy it shows the id of the writer; that of the reader follows it in
-  rmw_fastrtps' ``CustomClientInfo``.  Both must be of one participant.
+* The id in a request is in its header (``rmw_service_info_t``).  This is a C++ object to which
+  the first word after the head of rclpy's Python object refers, as in all objects of pybind11.
+  Its other fields must be those that rclpy shows.
+* A client of Fast DDS writes the id of the reader of its responses into its requests.  In Kilted
+  rmw shows the id of the reader.  In Jazzy rmw shows the id of the client's writer, and the id of
+  the reader follows it in ``CustomClientInfo`` of rmw_fastrtps.  Both ids must be of one
+  participant.
 
-Other uses: ``pointer`` of a client's handle.  Seen in 7.1 and 9.1.
+This also uses ``pointer`` of the handles of clients and services.  Seen in rclpy 7.1 and 9.1.
 """
 
 from __future__ import annotations

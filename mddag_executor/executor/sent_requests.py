@@ -13,11 +13,12 @@ Theory of operation
     other, so a request that is not older than the one that is just being sent is this one.
 3.  A request to an action is identified by its goal.
 4.  Another note is for the response: its callbacks inherit the same.  When the response is taken,
-    the note of its request is removed as well: the request went to another process, or another
-    thread took it before it was noted.
-5.  *Delivery within the process.*  The middleware delivers within ``send``.  So the sending thread
-    takes the request itself (its *receivers*), and the thread that sends the response takes that
-    one.  Otherwise the worker would begin something less urgent before it knows of them.
+    the note of its request is removed as well.  It is still there if the request went to another
+    process, or if another thread took the request before it was noted.
+5.  *Delivery within the process.*  The middleware has delivered a request when ``send`` returns.
+    So the sending thread takes the request at once (by its *receivers*), and the thread that sends
+    the response takes the response.  Otherwise a worker would begin something less urgent before
+    it knows of them.
 
 Requests that others have sent are never found: those of other processes, of other executors, of
 threads outside of callbacks, and of undeclared callbacks that inherit nothing.

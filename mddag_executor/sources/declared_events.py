@@ -6,16 +6,16 @@ What a trace with a declaration says of its jobs, as columns of its executions.
 Theory of operation
 -------------------
 In a run in which other executors ran some of the processes, messages say which execution belongs
-to which job (``imported_jobs``), and the jobs of the trace are not used.  Its events of
-executions without jobs have all that is needed (``undeclared_run``); for those of jobs, three
-other events have the rest:
+to which job (``imported_jobs``), and the jobs of the trace are not used.  The events of an
+execution without a job have all that is needed (``undeclared_run``).  For executions of jobs,
+three other kinds of events have the rest:
 
 1. ``job_release`` has the due time of a timer, and the stamp of a message that is released by
    its header stamp.  It is the due time of the dispatch of that job's source (column ``c``).
 2. ``complete`` has the CPU time of the execution, and whether it held the interpreter (column
    ``d``).  It is that of the last dispatch of its callback and job.
-3. ``fail`` means that the execution which is completed next, of the same vertex and job, has
-   raised an exception.
+3. ``fail`` means that an execution has raised an exception: the one with the next ``complete`` of
+   the same vertex and job.
 """
 
 from __future__ import annotations

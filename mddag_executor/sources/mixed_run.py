@@ -13,9 +13,10 @@ project have recorded end at the border of their process, so they are not used; 
 of executions is (``declared_events``).
 
 1. *Messages.*  LTTng records the source timestamp of a publication; a trace of this executor the
-   one of each message that it takes, and when each publication began and ended.  So both ways a
-   message is found by its topic and source timestamp (``links``, ``undeclared_run``).  If LTTng
-   has recorded none, a warning names each topic whose messages are not found.
+   one of each message that it takes, and when each publication began and ended.  So messages in
+   both directions are found by their topics and source timestamps (``links``,
+   ``undeclared_run``).  If LTTng has recorded no source timestamps, a warning names each topic
+   whose messages are not found.
 2. *Clocks.*  Times are those of the steady clock of the computer plus an offset, which LTTng and
    this executor read when they begin.  If both have recorded it, and the boot of the computer is
    the same, times of this executor are converted exactly to those of LTTng or, without LTTng, of
@@ -29,9 +30,10 @@ of executions is (``declared_events``).
    of their own.
 4. *Begin and end.*  Recordings begin and end at different times.  Jobs are judged from the first
    one on that had an execution in each recording, after the first release that its executor
-   judges.  After the recorded end of one of them its events are missing like those that a tracer
-   discards: jobs that need them are not judged.  A process of this executor without recorded end
-   was killed, and the run goes on.  Recordings whose times do not overlap are of several runs.
+   judges.  After the end of a recording, its events are missing like events that a tracer
+   discards: jobs that need them are not judged.  If a process of this executor has recorded no
+   end, it was killed, and the run goes on without it.  Recordings whose times do not overlap are
+   of several runs.
 """
 
 from __future__ import annotations
