@@ -636,6 +636,22 @@ def test_what_is_urgent_waits_less_for_a_callback_that_was_expected_to_end(deadl
     assert check.at == 2 * MS + engine.interpreter.patience() // 2
 
 
+def test_a_timer_that_fires_once_and_is_due_again_starts_no_other_job():
+    """As long as its callback, which cancels it, has not run: it runs as an undeclared one."""
+    task_set = loads(graph(n='name: a, timer: 10ms, once: true, deadline: 10ms'))
+    engine = new_engine(task_set)
+    entity = entity_of(engine, task_set, 0, 0)
+    for now in (0, 10 * MS):
+        engine.timer_due(Work(entity, print), now, now)
+    engine.timer_missed(entity, 10 * MS, 10 * MS, 3, 40 * MS)
+    jobs = []
+    while (work := engine.step(0, 40 * MS).work) is not None:
+        jobs.append(work.origin is not None)
+        engine.finished(work, 40 * MS, 40 * MS, 40 * MS, 0, 0)
+    assert jobs == [True, False]
+    assert engine.verdicts.tally.result()['dags']['/n']['jobs'] == 1
+
+
 def test_what_is_urgent_waits_no_longer_because_it_needs_the_interpreter():
     """It is not overtaken by a callback that is expected to end soon; that one may wait."""
     task_set = loads(graph(n="""
