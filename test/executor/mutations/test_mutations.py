@@ -215,10 +215,10 @@ client.completed = getattr(client, 'completed', 0) + 1
         'executor/pausing.py', 'pause.pause_here()', 'pass')], of(
         'test_gil.py', 'test_a_callback_pauses_while_a_more_urgent_one_computes[here]')),
     Case('paused_callbacks_wait_for_ever', [(
-        'executor/pausing.py', 'pauses.overtaker_waits(work)', 'pass')], of(
+        'executor/pausing.py', 'pauses.check(check)', 'pass')], of(
         'test_gil.py', 'test_a_callback_that_owns_a_lock_does_not_pause_for_ever[here-user]')),
     Case('threads_that_wait_for_the_gil_count_as_waiting', [(
-        'executor/gil_check.py', 'abs(address - _gil_address()) >= GIL_BYTES', 'True')], of(
+        'executor/gil_check.py', 'abs(address - gil) >= GIL_BYTES', 'True')], of(
         'test_gil_check.py',
         'test_a_thread_that_waits_for_the_gil_is_never_taken_for_one_that_waits[0]',
         'test_a_callback_that_computes_keeps_the_gil[0]'), every=True),
@@ -388,9 +388,26 @@ awaiting.named(
         'test_starters.py',
         'test_what_is_published_otherwise_belongs_to_no_job_and_is_named[a_task_that_goes_on]')),
     Case('threads_of_pools_publish_for_the_one_that_made_them', [(
-        'executor/starters.py', 'if not _calling.is_submitting and', 'if')], of(
+        'executor/starters.py', 'with starting_for_all():', 'if True:')], of(
         'test_starters.py',
         'test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it')),
+    Case('all_compute_if_the_kernel_hides_what_they_do', [(
+        'executor/gil_check.py', '(not gil or abs(address - gil) >= GIL_BYTES)',
+        'abs(address - gil) >= GIL_BYTES')], of(
+        'test_gil_check.py',
+        'test_without_proc_the_time_that_a_thread_has_computed_decides')),
+    Case('nodes_that_are_added_later_publish_nothing', [(
+        'executor/outside.py', 'number & (number - 1) == 0', 'number == 1')], of(
+        'test_starters.py',
+        'test_messages_are_counted_from_the_first_one_though_the_node_is_added_later')),
+    Case('who_goes_on_in_a_closed_group_waits_behind_fresh_ones', [(
+        'core/queues.py', '        _call_returning(s, heap)', '        pass')], of(
+        'core/test_outer_groups.py',
+        'test_several_that_go_on_in_a_closed_group_do_so_one_after_the_other')),
+    Case('an_owner_that_has_awaited_something_is_not_urged', [(
+        'core/queues.py', 'min(key[0], s.x_urged[x])', 'key[0]')], of(
+        'test_engine.py',
+        'test_the_owner_of_a_callback_group_is_urged_after_it_has_awaited_something_as_well')),
     Case('calls_keep_their_worker', [(
         'executor/publishing.py', "with running.lend(f'service {service_name(self)}'):",
         'if True:')], of(
