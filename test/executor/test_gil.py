@@ -205,6 +205,23 @@ def test_no_thread_waits_for_events_while_a_callback_computes(computing):
     assert not any(waiting)
 
 
+def test_no_thread_looks_all_the_time_because_something_less_urgent_waits(computing, monkeypatch):
+    """Nothing may overtake then, though the callback takes longer than usual."""
+    pool, looks, steps = pool_of(computing.executor), [], [time.monotonic()]
+    look = pool._look
+    monkeypatch.setattr(pool, '_look', lambda: (looks.append(1), look()))
+
+    def meanwhile():
+        steps.append(time.monotonic())
+        return len(steps) > 200
+
+    computing.meanwhile = meanwhile
+    computing.habit.mean_ns = 5 * MS
+    assert computing.order('patient') == ['begins', 'ends', 'patient']
+    # at most one a millisecond; if they are set to times that are over, it is four
+    assert len(looks) < 30 + (steps[-1] - steps[0]) / 0.0006
+
+
 @pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
 def test_a_callback_pauses_while_a_more_urgent_one_computes(computing):
     steps, still = [0], []
