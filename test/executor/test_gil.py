@@ -224,10 +224,11 @@ def test_no_thread_looks_all_the_time_because_something_less_urgent_waits(comput
 
 @pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
 def test_a_callback_pauses_while_a_more_urgent_one_computes(computing):
-    steps, still = [0], []
+    steps, still, paused = [0], [], []
 
     def step():
         steps[0] += 1
+        paused.append(current.running.work.paused_ns)
         return 'urgent' in computing.ran
 
     def urgent():
@@ -242,6 +243,7 @@ def test_a_callback_pauses_while_a_more_urgent_one_computes(computing):
     computing.meanwhile, computing.urgent, computing.takes = step, urgent, 0
     assert computing.order('urgent') == ['begins', 'urgent', 'ends']
     assert still and steps[0] > still[0]  # it went on then
+    assert paused[0] == 0 and paused[-1] >= 20 * MS  # which is no time that it has held the GIL
 
 
 @pytest.mark.parametrize('is_held_by', ['user', 'library'])
