@@ -34,7 +34,7 @@ import time
 import traceback
 from typing import Any
 
-from mddag_executor.executor.starters import forget_starter
+from mddag_executor.executor.starters import starting_for_all
 
 _CHECK_S = 0.05
 _LONGEST_CHECK_S = 1.0
@@ -132,8 +132,8 @@ class RunThreads:
         self._give(driver)
         thread = threading.Thread(
             target=self._run_driver, args=(driver,), daemon=True, name='mddag-rerun')
-        forget_starter(thread)  # it runs any callbacks
-        thread.start()
+        with starting_for_all():  # it runs any callbacks
+            thread.start()
 
     def _begin(self, run_thread: RunThread) -> None:
         self._here.run_thread = run_thread
