@@ -243,7 +243,7 @@ def test_a_callback_pauses_while_a_more_urgent_one_computes(computing):
     computing.meanwhile, computing.urgent, computing.takes = step, urgent, 0
     assert computing.order('urgent') == ['begins', 'urgent', 'ends']
     assert still and steps[0] > still[0]  # it went on then
-    assert paused[0] == 0 and paused[-1] >= 20 * MS  # which is no time that it has held the GIL
+    assert paused[0] == 0 and paused[-1] >= 20 * MS  # it does not count as holding the GIL
 
 
 @pytest.mark.parametrize('is_held_by', ['user', 'library'])
