@@ -204,5 +204,5 @@ def groups(values: Any) -> tuple[Ints, Ints]:
     if not len(values):
         none = np.empty(0, dtype=np.int64)
         return none, none
-    begins = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
-    return begins, np.r_[begins[1:], len(values)]
+    begins = np.append(0, np.flatnonzero(values[1:] != values[:-1]) + 1)
+    return begins, np.append(begins[1:], len(values))

@@ -80,9 +80,12 @@ class Numbering:
     def of(self, dag: Any, vertex: Any) -> tuple[Ints, Ints]:
         """Return DAGs and global vertices; -1 for unknown vertices."""
         known = (dag >= 0) & (dag < len(self._sizes) - 1)
-        at = np.where(known, dag, -1)
+        at = dag if known.all() else np.where(known, dag, -1)
         known &= (vertex >= 0) & (vertex < self._sizes[at])
-        return np.where(known, dag, -1), np.where(known, self._first[at] + vertex, -1)
+        numbers = self._first[at] + vertex
+        if known.all():
+            return at, numbers
+        return np.where(known, dag, -1), np.where(known, numbers, -1)
 
     def one(self, dag: int, vertex: int) -> int:
         """Return a global vertex; -1 if unknown."""

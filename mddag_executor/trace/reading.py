@@ -495,7 +495,7 @@ def _indexed(
         return nothing
     heads = rows_at(data, _HEAD, at)
     lengths = heads['length'].astype(np.int64)
-    ends = borders[np.searchsorted(borders, at, 'right')]       # of the blocks
+    ends = np.repeat(borders[1:], np.diff(np.searchsorted(at, borders)))    # of the blocks
     ends[:-1] = np.minimum(ends[:-1], at[1:])
     fits = (heads['opcode'] == Opcode.MESSAGE) & (lengths >= records.MESSAGE_HEAD.size) & (
         lengths <= len(data)) & (at + _CONTENT + lengths <= ends)
