@@ -106,7 +106,13 @@ def create_recording(path: str, overwrite: bool = False) -> BinaryIO:
 
 
 def close_recording(stream: BinaryIO) -> None:
-    """Close a new recording, and unlock it: a forked process may have it open as well."""
+    """
+    Close a new recording, and unlock it: a forked process may have it open as well.
+
+    A second call does nothing.
+    """
+    if stream.closed:
+        return
     with suppress(OSError):
         fcntl.flock(stream, fcntl.LOCK_UN)
     stream.close()

@@ -353,6 +353,12 @@ def receiver_of(waitable: Any) -> Any:
     return ACTION if type(getattr(waitable, '_handle', None)) is SERVER_HANDLE else None
 
 
+def clock_of(waitable: Any) -> Any:
+    """Return the clock of a waitable's timers, which is that of its node; None: it has no node."""
+    node = getattr(waitable, '_node', None)
+    return node.get_clock() if isinstance(node, Node) else None
+
+
 def exchanged(waitable: Any, data: Any) -> list[tuple[Any, ...]]:
     """
     Return which requests an action server has taken, or which responses an action client.

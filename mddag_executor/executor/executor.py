@@ -465,6 +465,7 @@ class MultiDeadlineExecutor(BareExecutor):
         Run callbacks on the pool until a future is done or the timeout is over.
 
         The callback that completes the future has ended on return, unless it takes much longer.
+        No callback starts after that, unless actions were handled: feedback may still come then.
 
         :param timeout_sec: seconds; None or negative: for ever; 0: run one callback at most.
         :raises Exception: the exception of a callback, or of the future if it is a task that has
@@ -482,6 +483,8 @@ class MultiDeadlineExecutor(BareExecutor):
             running = current.running
             work = None if running is None or running.pool is not self._pool else running.work
             completed_by.append(None if work is None else (running, work))
+            if self._upkeep.handled_waitables() == handled:  # else see ``_settle``
+                self._pool.start_no_more()
             self._at_once.ring()
 
         def is_done() -> bool:

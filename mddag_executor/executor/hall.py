@@ -44,6 +44,12 @@ class Timers(Protocol):
     def fire(self, source: Any) -> None:
         """Call a timer whose time has come, if rcl reports it due."""
 
+    def follow(self, clock: Any, ask: Callable[[], None]) -> None:
+        """Call a function after each jump of a clock, under the lock."""
+
+    def follow_no_more(self, clock: Any, ask: Callable[[], None]) -> None:
+        """End ``follow``."""
+
 
 class Hall(Protocol):
     """

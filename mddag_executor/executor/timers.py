@@ -217,6 +217,7 @@ class TimerQueue:
         #: returns how long a timer with a period may stay unnoticed while a callback computes
         self.allowance: Callable[[Entity, int], int] = lambda *_: 0
         self._jumps: dict[int, tuple[Clock, JumpHandle]] = {}
+        self._followers: list[tuple[Clock, Callable[[], None]]] = []
         self.has_jumped = False
 
     # --- timers --- ------------------------------------------------------------------------------
@@ -232,10 +233,18 @@ class TimerQueue:
         """Remove a timer."""
         self._timers.pop(id(source), None)
         self._agenda.cancel(source)
-        clock = source.rclpy_object.clock
-        if source.may_be_simulated and all(
-                each.rclpy_object.clock is not clock for each in self._timers.values()):
-            self._watch_no_more(clock)
+        if source.may_be_simulated:
+            self._watch_no_more(source.rclpy_object.clock)
+
+    def follow(self, clock: Clock, ask: Callable[[], None]) -> None:
+        """Call a function after each jump of a clock, under the lock."""
+        self._followers.append((clock, ask))
+        self._watch(clock)
+
+    def follow_no_more(self, clock: Clock, ask: Callable[[], None]) -> None:
+        """End ``follow``."""
+        self._followers.remove((clock, ask))
+        self._watch_no_more(clock)
 
     def _watch(self, clock: Clock) -> None:
         """Watch a clock for jumps.  A clock only borrows its jump callbacks, so this must end."""
@@ -250,6 +259,10 @@ class TimerQueue:
             self._jumps[id(clock)] = clock, handle
 
     def _watch_no_more(self, clock: Clock) -> None:
+        """End ``_watch``, if nothing else depends on the clock."""
+        if any(each.rclpy_object.clock is clock for each in self._timers.values()) or any(
+                each is clock for each, _ in self._followers):
+            return
         watched = self._jumps.pop(id(clock), None)
         if watched is not None:
             try:
@@ -301,6 +314,8 @@ class TimerQueue:
         for source in list(self._timers.values()):
             if source.may_be_simulated:
                 self.ask(source)
+        for _, ask in self._followers:
+            ask()
 
     def fire(self, source: TimerEntity) -> None:
         """Report a timer that is due, if rcl agrees, and set its next due time."""

@@ -17,7 +17,8 @@ Theory of operation
     event keeps its listener when the shared source is made again.  Meanwhile both sources contain
     it.  It notes in itself its place in the wait set that was filled last, so only one source may
     fill its set and ask it at a time (``_filling``).
-4.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next.
+4.  A timer within a waitable (the expiry of an action's goals) is checked when it is due next; in
+    simulated time, after each jump of the clock.
 5.  *The exception* is a thread that waits in a wait set (``WaitSetThread``).  It waits for rclpy's
     signal condition, because rclpy's handler of SIGTERM is written in C++: it triggers the
     condition without Python, and writes to no descriptor.  The thread also waits for waitables
@@ -44,6 +45,7 @@ from mddag_executor.executor.loop import ChannelSource
 from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, stop_at_exit
 from mddag_executor.executor.waitsets import FilledSet
 from mddag_executor.executor.work import Work
+from rclpy.clock import ClockType
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition
@@ -94,7 +96,12 @@ class WaitableEntity(AskedEntity):
     kind = 'waitable'
     list_name = 'waitables'
 
-    __slots__ = ()
+    __slots__ = ('_clock',)
+
+    def __init__(self, rclpy_object: Any, node: str) -> None:
+        super().__init__(rclpy_object, node)
+        # of the timers in it, if it may show simulated time
+        self._clock: Any = None
 
     def listen(self, rooms: Rooms) -> None:
         """Let it be asked when one of its parts has announced an arrival."""
@@ -102,10 +109,20 @@ class WaitableEntity(AskedEntity):
         key = compat.receiver_of(self.rclpy_object)
         if key is not None and self._source is not None:
             rooms.pool.engine.sent_requests.add_receiver(key, self._source.ask_now)
+        if self._source is not None and self._source.has_timers:
+            clock = compat.clock_of(self.rclpy_object)
+            if clock is not None and clock.clock_type == ClockType.ROS_TIME:
+                self._clock = self._source.clock = clock
+                with rooms.pool.lock:
+                    rooms.pool.timers.follow(clock, self._source.collect)
 
     def ignore(self) -> None:
         """End ``listen``."""
         rooms, source = self._rooms, self._source
+        clock, self._clock = self._clock, None
+        if clock is not None and rooms is not None and source is not None:
+            with rooms.pool.lock:
+                rooms.pool.timers.follow_no_more(clock, source.collect)
         key = compat.receiver_of(self.rclpy_object)
         if key is not None and rooms is not None and source is not None:
             rooms.pool.engine.sent_requests.remove_receiver(key, source.ask_now)
@@ -224,12 +241,14 @@ class WaitableSource(ChannelSource):
     Waitables and guard conditions that share a descriptor.
 
     :param entities: those of the waitables and guard conditions.
+    :ivar clock: of the timers in it; None: it cannot show simulated time.
     :raises ListenerError: when they contain an entity that has no listener, or none at all.
     :raises InvalidHandle: when one of them has been destroyed.
     """
 
     def __init__(self, entities: Iterable[Entity], pool: Hall) -> None:
         super().__init__()
+        self.clock: Any = None
         self.entities = list(entities)
         self._pool = pool
         self._asked = Asked(self.entities, pool)
@@ -245,6 +264,11 @@ class WaitableSource(ChannelSource):
         self._ignored = False
         # when it is asked next because of a timer, monotonic ns
         self._asks_at = 0
+
+    @property
+    def has_timers(self) -> bool:
+        """Return whether it contains timers."""
+        return bool(self._timers)
 
     def _add_part(self, kind: str, address: int) -> None:
         self._has_parts = True
@@ -322,6 +346,8 @@ class WaitableSource(ChannelSource):
             self._pool.call_at(time.monotonic_ns(), self._ask)
         if found:
             self._post_noted(found)
+        if self.clock is not None and self.clock.ros_time_is_active:
+            return  # its timers are due after a jump of the clock only
         with self._set.protected():
             times = [timer.until() for timer in self._timers]
         for until in times:

@@ -164,6 +164,21 @@ def test_an_interrupt_while_a_spin_ends_lets_threads_wait_in_the_next_one(
         pool.pause()
 
 
+def test_nothing_starts_after_the_callback_that_completes_the_future(make_executor):
+    """As in a single thread; what waits runs in the next spin."""
+    executor, ran = make_executor(num_workers=1), []
+    for _ in range(300):
+        ran.clear()
+        future = executor.create_future()
+        executor.create_task(ran.append, 'first')
+        executor.create_task(future.set_result, None)
+        executor.create_task(ran.append, 'last')
+        executor.spin_until_future_complete(future, 15.0)
+        assert len(ran) == 1    # the newest task comes first in some versions
+        executor.spin_once(15.0)
+        assert {*ran} == {'first', 'last'}
+
+
 def test_spinning_twice_is_an_error(make_executor):
     executor = make_executor()
     assert not executor.is_spinning

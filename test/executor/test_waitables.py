@@ -3,7 +3,7 @@
 """Actions, QoS events, guard conditions, waitables of a user's own, and timers with info."""
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 import os
 import sys
 import threading
@@ -18,6 +18,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import EventHandler, PublisherEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
+from rclpy.time import Time
 from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import Header
 from test_msgs.action import Fibonacci
@@ -142,6 +143,37 @@ def test_a_goal_expires_when_its_time_is_over(make_executor, make_node, stepwise
             assert wait_for(lambda: not counting.server._goal_handles)
             end.set_result(None)
             thread.join(30.0)
+    counting.destroy()
+
+
+@pytest.mark.parametrize('stepwise', [False, True])
+def test_a_goal_expires_when_simulated_time_is_over(make_executor, make_node, stepwise):
+    """It is not over while the clock of the node stands."""
+    node = make_node()
+    clock = node.get_clock()
+    counting = Counting(node, node, result_timeout=800.0)
+    executor = make_executor(nodes=[node])
+    clock._set_ros_time_is_active(True)
+
+    def set_clock(seconds):
+        clock.set_ros_time_override(
+            Time(nanoseconds=int(seconds * 1e9), clock_type=clock.clock_type))
+
+    def goals(seconds, expected):
+        """Set the clock; return whether so many goals are left then."""
+        set_clock(seconds)
+        return wait_for(lambda: stepwise and executor.spin_once(0.01) or (
+            len(counting.server._goal_handles) == expected))
+
+    with nullcontext() if stepwise else Spinning(executor):
+        for begin in (1000.0, 2000.0):
+            set_clock(begin)
+            task = executor.create_task(counting.ask(2))
+            assert wait_for(
+                lambda done=task.done: stepwise and executor.spin_once(0.01) or done())
+            assert task.result()[0] == SUCCEEDED
+            assert goals(begin + 799.0, 1)
+            assert goals(begin + 801.0, 0)
     counting.destroy()
 
 

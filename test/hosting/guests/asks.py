@@ -17,24 +17,33 @@ class Control(Node):
     """
     It awaits a service in each of its periods, after it has made work for others.
 
-    When it has had enough answers, it ends the run.
+    When it has had enough answers, it ends the run.  It awaits none before a first one has come:
+    the server may not know its client yet although it is ready, and then loses the request.
     """
 
     def __init__(self):
         super().__init__('control')
         self.n_answers = 0
+        self.is_known = False
         self.work = self.create_publisher(Empty, '/work', 50)
         self.client = self.create_client(Trigger, '/ask')
         self.create_timer(0.05, self.tick)
 
     async def tick(self):
-        if self.work.get_subscription_count() and self.client.service_is_ready():
+        if not (self.work.get_subscription_count() and self.client.service_is_ready()):
+            return
+        if not self.is_known:
+            self.client.call_async(Trigger.Request()).add_done_callback(self.note)
+        else:
             for _ in range(WORKS):
                 self.work.publish(Empty())
             assert (await self.client.call_async(Trigger.Request())).message == 'answer'
             self.n_answers += 1
             if self.n_answers == ENOUGH:
                 rclpy.shutdown()
+
+    def note(self, _):
+        self.is_known = True
 
 
 class Serving(Node):
