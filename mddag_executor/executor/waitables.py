@@ -45,7 +45,7 @@ from mddag_executor.executor.loop import ChannelSource
 from mddag_executor.executor.shutdown import call_at_shutdown, is_over, join, stop_at_exit
 from mddag_executor.executor.waitsets import FilledSet
 from mddag_executor.executor.work import Work
-from rclpy.clock import ClockType
+from rclpy.clock_type import ClockType
 from rclpy.event_handler import EventHandler
 from rclpy.exceptions import InvalidHandle
 from rclpy.guard_condition import GuardCondition

@@ -160,7 +160,7 @@ def test_a_goal_expires_when_simulated_time_is_over(make_executor, make_node, st
             Time(nanoseconds=int(seconds * 1e9), clock_type=clock.clock_type))
 
     def goals(seconds, expected):
-        """Set the clock; return whether so many goals are left then."""
+        """Set the clock; return whether this many goals are left then."""
         set_clock(seconds)
         return wait_for(lambda: stepwise and executor.spin_once(0.01) or (
             len(counting.server._goal_handles) == expected))
