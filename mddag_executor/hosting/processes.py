@@ -289,10 +289,13 @@ class Part:
 
     def write_result(self, result: Any) -> None:
         """Store the result of this process in the folder, which goes if the run was killed."""
-        if os.getppid() != self.parent:     # nothing else can remove it
+        try:
+            _write(self.folder / f'{os.getpid()}.json', json.dumps(result, default=list))
+        except FileNotFoundError:   # another process has removed it, if the run was killed
+            if os.getppid() == self.parent:
+                raise
+        if os.getppid() != self.parent:     # nothing else can remove it; it may have died just now
             shutil.rmtree(self.folder, ignore_errors=True)
-            return
-        _write(self.folder / f'{os.getpid()}.json', json.dumps(result, default=list))
 
     @staticmethod
     def has_begun(folder: str) -> bool:
