@@ -249,7 +249,7 @@ class TimerFd:
         if at >= NEVER:
             self._unset()
             return
-        if at <= 0:  # the system call knows no negative times, and 0 stands for none
+        if at <= 0:  # the system call accepts no negative time, and 0 means that none is set
             at = 1
         fields = self._time
         fields[2] = at // 1_000_000_000

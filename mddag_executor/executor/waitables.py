@@ -96,12 +96,7 @@ class WaitableEntity(AskedEntity):
     kind = 'waitable'
     list_name = 'waitables'
 
-    __slots__ = ('_clock',)
-
-    def __init__(self, rclpy_object: Any, node: str) -> None:
-        super().__init__(rclpy_object, node)
-        # of the timers in it, if it may show simulated time
-        self._clock: Any = None
+    __slots__ = ()
 
     def listen(self, rooms: Rooms) -> None:
         """Let it be asked when one of its parts has announced an arrival."""
@@ -112,17 +107,16 @@ class WaitableEntity(AskedEntity):
         if self._source is not None and self._source.has_timers:
             clock = compat.clock_of(self.rclpy_object)
             if clock is not None and clock.clock_type == ClockType.ROS_TIME:
-                self._clock = self._source.clock = clock
+                self._source.clock = clock
                 with rooms.pool.lock:
                     rooms.pool.timers.follow(clock, self._source.collect)
 
     def ignore(self) -> None:
         """End ``listen``."""
         rooms, source = self._rooms, self._source
-        clock, self._clock = self._clock, None
-        if clock is not None and rooms is not None and source is not None:
+        if rooms is not None and source is not None and source.clock is not None:
             with rooms.pool.lock:
-                rooms.pool.timers.follow_no_more(clock, source.collect)
+                rooms.pool.timers.follow_no_more(source.clock, source.collect)
         key = compat.receiver_of(self.rclpy_object)
         if key is not None and rooms is not None and source is not None:
             rooms.pool.engine.sent_requests.remove_receiver(key, source.ask_now)

@@ -273,6 +273,7 @@ class Entities:
             self.callbacks.add(pid, address, time, found)
         return found
 
+
 def full_name(namespace: str, name: str) -> str:
     """Return the full name of a node."""
     return f'{namespace.rstrip("/")}/{name}'

@@ -359,6 +359,16 @@ def test_a_lifecycle_node_publishes_only_while_it_is_active(
     node.destroy_node()
 
 
+def belongs_to_no_job(each, schedule):
+    """Run a detector while another thread lets its threads publish: results are not due."""
+    thread = threading.Thread(target=schedule)
+    thread.start()
+    found, = each.run()
+    thread.join()
+    assert 'threads of its own' in found.text
+    assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
+
+
 def test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it(make_executor, make_node):
     """Others submit functions as well, while the execution still runs."""
     has_made, has_published = threading.Semaphore(0), threading.Semaphore(0)
@@ -376,12 +386,7 @@ def test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it(make_execu
             has_published.release()
 
     each = Detector(make_executor, make_node, publish)
-    thread = threading.Thread(target=submit)
-    thread.start()
-    found, = each.run()
-    thread.join()
-    assert 'threads of its own' in found.text
-    assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
+    belongs_to_no_job(each, submit)
 
 
 def test_a_thread_of_asyncio_works_for_no_execution_that_has_only_started_it(
@@ -403,12 +408,7 @@ def test_a_thread_of_asyncio_works_for_no_execution_that_has_only_started_it(
             loop.call_soon_threadsafe(has_published.release)
 
     each = Detector(make_executor, make_node, publish)
-    thread = threading.Thread(target=schedule)
-    thread.start()
-    found, = each.run()
-    thread.join()
-    assert 'threads of its own' in found.text
-    assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
+    belongs_to_no_job(each, schedule)
 
 
 def observed(watch, executor):
