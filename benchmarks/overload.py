@@ -142,7 +142,7 @@ class _Case:
     ) -> float:
         """Return the share of the results of some DAGs that are in time."""
         settings = Settings(
-            policy=policy, workers=self._args.workers, duration_ns=self._args.duration,
+            policy=policy, pools=(self._args.workers,), duration_ns=self._args.duration,
             preemptive=self._mode.preemptive and policy != 'fifo')
         tables = tables._replace(on_late=[ON_LATE[on_late]] * len(tables.on_late))
         compiled = prepare(tables, load, settings, 24 * len(WAYS) * (self._args.sets or 1))

@@ -50,7 +50,7 @@ def check_slack(
     from msg_graph import loads
     times = _times(task_set, args.utilisation[0], args.workers[0])
     fixed = loads(with_times(task_set, times), task_set.file)
-    settings = Settings(workers=args.workers[0])
+    settings = Settings(pools=(args.workers[0],))
     load = periodic_workload(fixed, draw_execution_times(fixed, 0), settings.duration_ns)
     with Progress('recording', 2 * args.callbacks) as line:
         slack = find_slack(Problem(

@@ -93,7 +93,7 @@ def time_vertex_jobs(
     rate = sum(len(dag.vertices) / dag.period_ns for dag in task_set.dags)
     duration_ns = max(max(_PERIODS_NS), round(vertex_jobs / rate))
     judge = judge_of(task_set, duration_ns, core == 'compiled')
-    settings = Settings('rad', WORKERS, duration_ns, True, 'completions', True)
+    settings = Settings('rad', (WORKERS,), duration_ns, True, 'completions', True)
     done = sum(-(-duration_ns // dag.period_ns) * len(dag.vertices) for dag in task_set.dags)
     times = Draws(task_set, 0).times(0, 1)
     accepted = judge(settings, times)
@@ -116,7 +116,7 @@ def time_core(
     :raises mddag_executor.core.PolicyError: if there is no such policy.
     :raises InputError: if a callback declares no execution time.
     """
-    settings = Settings(policy, workers, duration_ns, preemptive=None)
+    settings = Settings(policy, (workers,), duration_ns, preemptive=None)
     tables = Tables.build(task_set)
     load = periodic_workload(task_set, draw_execution_times(task_set, seed), duration_ns)
 

@@ -48,7 +48,7 @@ def main(args: argparse.Namespace) -> int:
     workers = defaults.workers(args.workers, task_set)
     times = execution_times(args, task_set, workers)
     settings = Settings(
-        policy=args.policy, on_late=args.on_late, workers=workers, duration_ns=args.duration,
+        policy=args.policy, on_late=args.on_late, pools=(workers,), duration_ns=args.duration,
         preemptive=bool(args.preemptive), judge=args.judge,
         stop_at_first_miss=args.stop_at_first_miss, cpus=args.cpus)
     load = periodic_workload(task_set, times, args.duration)

@@ -12,6 +12,7 @@ A recorded run is rescheduled (see `replay --reschedule`), and a declaration is 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from mddag_executor import defaults
@@ -24,7 +25,10 @@ from mddag_executor.output_rules import is_declaration
 if TYPE_CHECKING:
     from mddag_executor.results.sinks import DagCounts, Requirements
     from mddag_executor.whatif.slack import Problem
-    from msg_graph import TaskSet
+    from msg_graph import Process, TaskSet
+
+    _Given = tuple[
+        Problem, TaskSet, dict[str, DagCounts], Sequence[Process], Requirements]
 
 EXAMPLE = """\
 mddag slack run.mcap
@@ -66,11 +70,11 @@ def main(args: argparse.Namespace) -> int:
     from mddag_executor.whatif.slack import find_slack, slack_result
     common.recording_and_graph(args)
     is_graph = is_declaration(str(args.trace))
-    problem, task_set, dags, required = (_of_graph if is_graph else _of_trace)(args)
+    problem, task_set, dags, processes, required = (_of_graph if is_graph else _of_trace)(args)
     callbacks = len(set(problem.callback_of))
     with Progress('searching', callbacks) as line:
         slack = find_slack(problem, line.update, args.parallel or defaults.processors())
-    result = slack_result(slack, task_set, dags, problem.settings.processes, required)
+    result = slack_result(slack, task_set, dags, processes, required)
     if args.report is not None:
         common.write_text(args.report, ''.join(page(result, str(args.trace))))
     common.show(args, result, lines(result))
@@ -84,9 +88,7 @@ def main(args: argparse.Namespace) -> int:
         for one in result['callbacks'].values()))
 
 
-def _of_trace(
-    args: argparse.Namespace,
-) -> tuple[Problem, TaskSet, dict[str, DagCounts], Requirements]:
+def _of_trace(args: argparse.Namespace) -> _Given:
     from mddag_executor.whatif.reschedule import reschedule
     from mddag_executor.whatif.slack import Problem
     options.reject_options(args, _ONLY_GRAPH, 'a recording has its own: leave the option out')
@@ -104,12 +106,11 @@ def _of_trace(
     problem = Problem(work.load, outcome.settings, outcome.tables,
                       outcome.task_set.places_of_vertices(), work.dispatches)
     result = outcome.result()
-    return problem, outcome.task_set, result['dags'], result.get('requirements', {})
+    return (problem, outcome.task_set, result['dags'], outcome.processes,
+            result.get('requirements', {}))
 
 
-def _of_graph(
-    args: argparse.Namespace,
-) -> tuple[Problem, TaskSet, dict[str, DagCounts], Requirements]:
+def _of_graph(args: argparse.Namespace) -> _Given:
     from mddag_executor.core import Tables
     from mddag_executor.simulate import periodic_workload, Settings
     from mddag_executor.simulate import simulate as simulated
@@ -128,7 +129,7 @@ def _of_graph(
     args.seed = args.seed or 0
     times = simulate.execution_times(args, task_set, workers)
     settings = Settings(
-        policy=args.policy or 'rad', workers=workers,
+        policy=args.policy or 'rad', pools=(workers,),
         duration_ns=args.duration or defaults.DURATION_NS, preemptive=bool(args.preemptive),
         cpus=args.cpus)
     load = periodic_workload(task_set, times, settings.duration_ns)
@@ -136,4 +137,4 @@ def _of_graph(
     run = simulated(task_set, load, settings, log=requires)
     problem = Problem(load, settings, Tables.build(task_set), task_set.places_of_vertices())
     required = ComputedRun.of_run(task_set, load, run).requirements() if requires else {}
-    return problem, task_set, run.result()['dags'], required.get('requirements', {})
+    return problem, task_set, run.result()['dags'], (), required.get('requirements', {})

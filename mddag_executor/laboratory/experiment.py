@@ -72,7 +72,7 @@ class Experiment:
         """Return how to simulate a run under a policy."""
         preemptive = preempts(policy, self.preemptive)
         return Settings(
-            policy=policy, workers=self.workers, duration_ns=self.duration_ns,
+            policy=policy, pools=(self.workers,), duration_ns=self.duration_ns,
             preemptive=preemptive, judge=self.judge, stop_at_first_miss=True,
             dispatch_overhead_ns=self.overhead_ns)
 

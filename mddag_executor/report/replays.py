@@ -146,10 +146,11 @@ def summary(result: Mapping[str, Any]) -> Iterator[str]:
     if result['rescheduled']:
         if result['estimated_executions']:
             yield (f'{result["estimated_executions"]} of {result["executions"]} executions did '
-                   'not complete in the recording: they take the median of their callback')
+                   'not complete in the recording: they take the median of their callback, '
+                   'or as long as they ran')
         if result.get('skipped_jobs'):
-            yield (f'{counted(result["skipped_jobs"], "job")} skipped by a timer in the '
-                   'recording: skipped again, so expired')
+            yield (f'{counted(result["skipped_jobs"], "job")} whose first callback did not run in '
+                   'the recording: skipped again, so expired')
         return
     undeclared = result['undeclared']
     if undeclared['executions']:

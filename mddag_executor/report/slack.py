@@ -93,12 +93,13 @@ def _load_lines(result: Mapping[str, Any]) -> Iterator[str]:
         f'it must be less than {1 / most:g} times; {printable(load["breaks"])} misses'
         if load['factor'] == 0 else
         f'{_times(load["factor"])}, then {printable(load["breaks"])} misses')
-    each = ' in each process' if result['processes'] > 1 else ''
-    for of, name in (('workers', 'worker'), ('cpus', 'CPU')):
-        fewer = result[of]
+    pools = [(f' in {printable(process["name"])}', process['workers'])
+             for process in result.get('processes', ())]
+    for name, place, fewer in (
+            ('worker', '', result['workers']), *(('worker', *pool) for pool in pools),
+            ('CPU', '', result['cpus'])):
         if fewer is not None:
-            of_each = each if of == 'workers' else ''
-            some = f'{fewer["least"]} of {counted(fewer["given"], name)}{of_each}'
+            some = f'{fewer["least"]} of {counted(fewer["given"], name)}{place}'
             yield f'{some} {"is" if fewer["least"] == 1 else "are"} enough' + (
                 '' if fewer['breaks'] is None else
                 f'; with one less {printable(fewer["breaks"])} misses')

@@ -474,7 +474,7 @@ class RescheduleResultRare(TypedDict, total=False):
     processes: list[ProcessPool]
     """The processes, if there are several."""
     skipped_jobs: int
-    """Releases that the timer skipped in the recording, if any: they are skipped again."""
+    """Jobs whose first callback did not run in the recording, if any: they are skipped again."""
     notes: list[str]
     """Assumptions about an ordinary bag, one line each."""
 
@@ -501,7 +501,7 @@ class RescheduleResult(RescheduleResultRare, PathsResult, Verdicts):
     executions: int
     """Number of executions."""
     estimated_executions: int
-    """How many of them did not complete in the recording: they take their callback's median."""
+    """How many did not complete in the recording: they take a median, or as long as they ran."""
     overheads: Overheads
     """The executor's own times."""
     worker_use: ScheduledUse

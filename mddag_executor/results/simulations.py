@@ -151,11 +151,22 @@ class SinkMargin(TypedDict):
     """The time that is left to the deadline now; null if nothing completed."""
 
 
-class SlackResultRare(TypedDict, total=False):
-    """Keys of the result of `slack` that are only there if something is required of paths."""
+class SlackProcess(TypedDict):
+    """A process of a result of `slack`."""
 
+    name: str
+    """Name of the process."""
+    workers: FewerResult | None
+    """How many workers are enough in it, with the numbers of the others; null as below."""
+
+
+class SlackResultRare(TypedDict, total=False):
+    """Keys of the result of `slack` that only some have."""
+
+    processes: list[SlackProcess]
+    """The processes, if there are several."""
     requirements: dict[str, SinkMargin]
-    """By requirement, called `PATH reaction` or `PATH age`, its margin."""
+    """By requirement, if there is any, called `PATH reaction` or `PATH age`, its margin."""
 
 
 class SlackResult(SlackResultRare):
@@ -163,14 +174,12 @@ class SlackResult(SlackResultRare):
 
     most: float
     """The largest factor that was tried."""
-    processes: int
-    """Number of processes."""
     callbacks: dict[str, SlackFactor]
     """By callback the factor for its execution times alone."""
     load: SlackFactor
     """The factor for the execution times of all callbacks together."""
     workers: FewerResult | None
-    """How many workers are enough; null if it is unknown, or deadlines are missed."""
+    """How many workers are enough; null if deadlines are missed, or there are `processes`."""
     cpus: FewerResult | None
     """How many CPUs are enough; null if it is unknown, or deadlines are missed."""
     missed: dict[str, int]

@@ -83,7 +83,7 @@ def simulate(
 
 def check(settings: Settings) -> None:
     """Check settings."""
-    for workers in settings.workers_of:
+    for workers in settings.pools:
         if not 1 <= workers <= MOST_WORKERS:
             raise UsageError(f'workers: {workers} is out of range: give 1 to {MOST_WORKERS}')
     if settings.duration_ns < 1:

@@ -40,7 +40,7 @@ class Settings:
     """
     How a load is scheduled.
 
-    :ivar workers: of each process; ``pools``: by process its number of workers, if these differ.
+    :ivar pools: by process its number of workers; each process has its own interpreter.
     :ivar duration_ns: when the run ends, on the load's clock.
     :ivar preemptive: None: the policy's own mode of the paper's experiment.
     :ivar judge: ``horizon`` judges open jobs at the end, ``completions`` (as in the paper) only
@@ -50,12 +50,11 @@ class Settings:
     :ivar cpus: shared by the executions that compute; None: enough for all.
     :ivar judge_from: jobs released before are not judged; ``judge_until``: nor those released
         then or later.
-    :ivar processes: number of processes, each with its own interpreter.
     :ivar on_late: handling of late jobs of a DAG that does not declare it.
     """
 
     policy: str = 'rad'
-    workers: int = defaults.WORKERS
+    pools: tuple[int, ...] = (defaults.WORKERS,)
     duration_ns: int = defaults.DURATION_NS
     preemptive: bool | None = False
     judge: str = 'horizon'
@@ -65,25 +64,23 @@ class Settings:
     cpus: int | None = None
     judge_from: int = -NEVER
     judge_until: int = NEVER
-    processes: int = 1
     on_late: str = 'continue'
-    pools: tuple[int, ...] = ()
 
     @property
-    def workers_of(self) -> tuple[int, ...]:
-        """Return by process its number of workers."""
-        return self.pools or (self.workers,) * self.processes
+    def workers(self) -> int:
+        """Return the number of workers of all processes."""
+        return sum(self.pools)
 
     @property
     def preempts(self) -> bool:
         """Return whether a more urgent execution preempts a running one."""
-        return preempts(self.policy, self.preemptive, len(self.workers_of))
+        return preempts(self.policy, self.preemptive, len(self.pools))
 
     @property
     def engine_options(self) -> EngineOptions:
         """Return the settings as integers for the engine; raise like ``preempts``."""
         return EngineOptions(
-            list(self.workers_of), int(self.preempts),
+            list(self.pools), int(self.preempts),
             int(self.policy == ROS2), find_policy(self.policy).urgency,
             self.dispatch_overhead_ns,
             self.switch_overhead_ns, self.judge_from, self.judge_until, self.cpus or NEVER,

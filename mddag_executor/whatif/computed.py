@@ -93,7 +93,7 @@ class ComputedRun(NamedTuple):
         stopped = run.settings.stop_at_first_miss and run.ended_ns < run.settings.duration_ns
         judged = run.settings.judge == 'horizon' and not stopped
         return cls(task_set, load, run.log, run.decisions, run.ended_ns, judged,
-                   processes=task_set.processes if run.settings.processes > 1 else ())
+                   processes=task_set.processes if len(run.settings.pools) > 1 else ())
 
     def recording(self, workers: int = 0) -> Recording:
         """

@@ -13,7 +13,10 @@ Theory of operation
   from the time at which it was noticed.  A single worker notices nothing while it runs a callback,
   so all timers that became due meanwhile count as known from their releases.
 * The execution time of a vertex is the sum of the pieces of its execution.  If it did not complete
-  (dropped, expired, open at the end), it is the callback's median, otherwise the declared mean.
+  (dropped, expired, open at the end), it is the callback's median, otherwise the declared mean,
+  and at least as long as it has run.  A failed execution has the time until it failed.
+* A callback without any known time never ran in the recording, so it does not run here either: its
+  messages never arrive, and jobs that begin with it are skipped.
 * A job that expired at its release never ran: its timer was noticed after its next period.  This
   depends on the machine, not on the scheduler, so the job is skipped again.
 * A sync vertex has the execution time of the leg that completed it.  Earlier legs, which only
@@ -70,7 +73,7 @@ class RecordedLoad(NamedTuple):
 
     ``jobs`` has, by DAG, the recorded index of each job; ``demand`` the execution times of all
     declared jobs, ns; ``estimated`` counts vertices of jobs without a recorded execution time,
-    ``executions`` counts all; ``unknown`` names callbacks without any known time. ``dispatches``
+    ``executions`` counts all; ``silent`` names callbacks that never ran. ``dispatches``
     is the dispatch part of ``load.costs``; it is empty without overheads. ``dispatch_ns`` and
     ``transport_ns`` are measured medians, None if nothing was measured.
     """
@@ -80,7 +83,7 @@ class RecordedLoad(NamedTuple):
     demand: int
     executions: int
     estimated: int
-    unknown: list[str]
+    silent: list[str]
     dispatch_ns: int | None = None
     transport_ns: int | None = None
     dispatches: Any = ()
@@ -165,6 +168,8 @@ class LoadBuilder:
         self._note_ends()
         self._others, self._dispatch_ns = [np.empty((0, 4), dtype=np.int64)], np.empty(
             0, dtype=np.int64)
+        #: By place of an execution that did not complete: how long it has run, ns.
+        self._so_far = dict[int, int]()
         #: By global vertex: the address of the callback that ran as it.
         self.callback_of: dict[int, int] = {}
         if not len(recording.executions):
@@ -175,6 +180,7 @@ class LoadBuilder:
         self._row = np.where(places >= 0, places - jobs.first[table['dag']], _UNKNOWN)
         self._note_pieces()
         self._note_completions()
+        self._note_incomplete()
         self._note_publications()
         del self._row, self._executions
 
@@ -315,6 +321,18 @@ class LoadBuilder:
             self._split_legs(self._tables.dag_of[v], row[every_leg & (vertex == v)],
                              self._edges_into[v])
 
+    def _note_incomplete(self) -> None:
+        """Note how long executions ran that did not complete: open ones until the end at least."""
+        table, row = self._executions, self._row
+        rows = np.flatnonzero((table['vertex'] >= 0) & (row >= 0) & (table['start'] >= 0))
+        place = self._places(_VERTEX, row[rows], table['vertex'][rows])
+        missing = self._columns['took'][place] < 0
+        rows, place = rows[missing], place[missing]
+        start, end = table['start'][rows], table['end'][rows]
+        took = np.where(end < 0, self._recording.end + 1, end) - start
+        for at, time in zip(place.tolist(), took.tolist()):
+            self._so_far[at] = self._so_far.get(at, 0) + time
+
     def _split_legs(self, dag: int, rows: Ints, edges: list[int]) -> None:
         """If one execution completed all legs, only the last message's time is known."""
         end, arrived = self._of(dag, 'end', 'arrived')
@@ -388,19 +406,21 @@ class LoadBuilder:
         only_one = np.array([
             workers is not None and workers[new - 1] == 1 < self._workers[old - 1]
             for old, new in zip(self._process, process)], dtype=np.bool_)
-        ran = len(self._recording.executions) > 0
         every, usual, late = self._dispatches()
         if not overheads:
             late = late[:0].copy()
         self._subtract_others(only_one | (max(process) < max(self._process)))
+        typical = self._typical()
         unsent, delays, transport = self._unsent(), None, None
+        silent = self._silence(typical, unsent)
+        ran = len(self._recording.executions) > 0 or silent
         if ran:
             delays, transport = self._transports(overheads, process)
             if unsent:
                 delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
         for name in ('start', 'end', 'arrived', 'sent'):    # they are large for long runs
             del self._columns[name]
-        estimated, unknown = self._estimate(process, unsent)
+        estimated = self._estimate(process, typical, unsent)
         del unsent
         took, cpu, held = (self._columns.pop(name) for name in ('took', 'cpu', 'held'))
         demand, executions = int(took.sum()), len(took)
@@ -426,7 +446,7 @@ class LoadBuilder:
         load = self._load(costs, others[:, 0], overheads, only_one)
         return RecordedLoad(
             load._replace(fates=self._fates(len(costs)), **columns),
-            self._numbers, demand, executions, estimated, unknown, usual, transport, late)
+            self._numbers, demand, executions, estimated, silent, usual, transport, late)
 
     def _inherited(self, ready: Ints, deadline: Ints) -> dict[str, Any]:
         """
@@ -464,15 +484,32 @@ class LoadBuilder:
                     :, list(dag.vertices[v].predecessors)].any(axis=1)
         return found
 
-    def _estimate(self, process: Sequence[int], unsent: list[Any]) -> tuple[int, list[str]]:
+    def _silence(self, typical: dict[str, int], unsent: list[Any]) -> list[str]:
         """
-        Fill in execution and CPU times that were not recorded.
+        Let callbacks without any known time not run; return them.
 
         :param unsent: by DAG, job and edge whether the edge is not satisfied.
-        :return: their number, and the callbacks without any known time.
         """
-        typical = self._typical()
-        unknown: dict[str, None] = {}
+        silent: dict[str, None] = {}
+        for dag, edges in zip(self._task_set.dags, unsent if self._times is None else ()):
+            took, = self._of(dag.index, 'took')
+            missing = (took < 0) & ~self._never_ready(dag, edges)
+            for vertex in dag.vertices:
+                if vertex.callback.key not in typical and missing[:, vertex.index].any():
+                    silent[vertex.callback.key] = None
+                    edges[:, self._edges_into[self._first[dag.index] + vertex.index]] = True
+                    if vertex.index == dag.source:
+                        self._skipped |= {(dag.index, row) for row in range(len(took))}
+        return list(silent)
+
+    def _estimate(
+        self, process: Sequence[int], typical: dict[str, int], unsent: list[Any]
+    ) -> int:
+        """
+        Fill in execution and CPU times that were not recorded; return their number.
+
+        :param unsent: by DAG, job and edge whether the edge is not satisfied.
+        """
         estimated = 0
         for dag, edges in zip(self._task_set.dags, unsent):
             took, cpu, held = self._of(dag.index, 'took', 'cpu', 'held')
@@ -486,9 +523,8 @@ class LoadBuilder:
             for vertex in dag.vertices:
                 v, key = vertex.index, vertex.callback.key
                 if missing[:, v].any():
-                    if key not in typical:
-                        unknown[key] = None
                     took[missing[:, v], v] = typical.get(key, 0)
+                    self._extend(self._first[dag.index] + v, took[:, v], missing[:, v])
                 known = cpu[:, v] >= 0
                 if known.any():     # executions that did not complete are like the others
                     share = cpu[known, v].sum() / max(1, took[known, v].sum())
@@ -499,7 +535,14 @@ class LoadBuilder:
                     if vertex.callback.holds_interpreter:
                         cpu[~known, v] = took[~known, v]
                 held[:, v] *= process[self._first[dag.index] + v]
-        return estimated, list(unknown)
+        return estimated
+
+    def _extend(self, vertex: int, took: Ints, missing: Mask) -> None:
+        """Let executions that did not complete take the time that they ran, or longer."""
+        for row in np.flatnonzero(missing).tolist() if self._so_far else ():
+            so_far = self._so_far.get(int(self._places(_VERTEX, row, vertex)))
+            if so_far is not None:
+                took[row] = so_far if (vertex, row) in self._failed else max(so_far, took[row])
 
     def _fates(self, executions: int) -> list[int]:
         """Return which executions failed or were skipped; empty: none."""
@@ -603,7 +646,11 @@ class LoadBuilder:
         return found
 
     def _typical(self) -> dict[str, int]:
-        """Return by callback the median of its recorded times, otherwise the declared mean."""
+        """
+        Return by callback the median of its recorded times, otherwise the declared mean.
+
+        Otherwise it is the longest time of an execution that did not complete.
+        """
         recorded: dict[str, list[Any]] = {}
         for dag in self._task_set.dags:
             took, = self._of(dag.index, 'took')
@@ -617,4 +664,18 @@ class LoadBuilder:
             times = times[times >= 0]
             if len(times):
                 typical[key] = quantile(memoryview(times), 0.5)
+        for key, so_far in self._longest_incomplete().items():
+            typical.setdefault(key, so_far)
         return typical
+
+    def _longest_incomplete(self) -> dict[str, int]:
+        """Return by callback the longest time of an execution that did not complete."""
+        longest: dict[str, int] = {}
+        places = np.array(list(self._so_far), dtype=np.int64)
+        for dag, begin in zip(self._task_set.dags, self._begins[_VERTEX].tolist()):
+            width = len(dag.vertices)
+            mine = places[(places >= begin) & (places < self._begins[_VERTEX, dag.index + 1])]
+            for place in mine.tolist():
+                key = dag.vertices[(place - begin) % width].callback.key
+                longest[key] = max(longest.get(key, 0), self._so_far[place])
+        return longest

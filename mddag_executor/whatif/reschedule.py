@@ -71,7 +71,7 @@ class Reschedule:
         self.task_set, self._run, self.notes = run.task_set, run, run.run.notes
         self.work, self.tables, self.settings = work, tables, settings
         self.recorded, self.processes, self.warnings = recorded, processes, warnings
-        self.workers = sum(settings.workers_of)
+        self.workers = settings.workers
         self._skip, self._overheads = skip, overheads
         self.tally = Tally(run.task_set, tables)
         result = schedule(tables, work.load, settings)
@@ -87,7 +87,7 @@ class Reschedule:
     def worker_names(self) -> list[str]:
         """Return the names of workers, if they are more than a number."""
         return [f'{process.name} {w}' for process, workers in zip(
-            self.processes, self.settings.workers_of) for w in range(workers)]
+            self.processes, self.settings.pools) for w in range(workers)]
 
     @property
     def _requires(self) -> bool:
@@ -147,7 +147,7 @@ class Reschedule:
         if self.processes:
             processes['processes'] = [
                 {'name': each.name, 'nodes': list(each.nodes), 'workers': workers}
-                for each, workers in zip(self.processes, settings.workers_of)]
+                for each, workers in zip(self.processes, settings.pools)]
         if skipped := work.load.fates.count(SKIPPED):
             skips['skipped_jobs'] = skipped
         if self.notes:
@@ -222,14 +222,17 @@ def reschedule(
         without executions.
     :raises mddag_executor.trace.TraceError: if the file is not a trace.
     :raises mddag_executor.ReplayError: if the trace has nothing to replay, none of the
-        declaration's callbacks, or an execution time that is neither recorded nor declared.
+        declaration's callbacks; or if it is an ordinary bag, and an execution time is not
+        declared.
     :raises mddag_executor.errors.MddagError: for an invalid policy, number of workers or CPUs, or
         overhead.
     """
     if policy is not None:
         preempts(policy, preemptive or False)
     given_pools = (workers,) if isinstance(workers, int) else tuple((workers or {}).values())
-    check(Settings(pools=given_pools, cpus=cpus, dispatch_overhead_ns=dispatch_overhead))
+    check(Settings(
+        pools=given_pools or Settings.pools, cpus=cpus,
+        dispatch_overhead_ns=dispatch_overhead))
     run = path if isinstance(path, Recording) else path() if callable(path) else open_recording(
         path, task_set, name, progress)
     if run.task_set is EMPTY_TASK_SET:
@@ -270,11 +273,6 @@ def reschedule(
     preempts(policy, preemptive, len(placed))
     with gc_paused():
         work = builder.build(overheads, tables.process, pools)
-    if work.unknown:
-        raise ReplayError(
-            run.name, f'{counted(len(work.unknown), "callback")} did not complete in it, '
-            f'and no execution_time is declared: {listed(work.unknown)}',
-            'give a GRAPH that declares it')
     tables = with_groups(
         tables, builder.callback_of, run.exclusive_groups(), declared_first=not run.run.same)
     left_out = builder.left_out
@@ -287,6 +285,15 @@ def reschedule(
     if recorded is not None:
         warnings, judge_from = recorded.warnings, recorded.judged.judge_from
     warnings += notes
+    if work.silent and recorded is None:
+        raise ReplayError(
+            run.name, 'it has no execution times, and none is declared for '
+            f'{counted(len(work.silent), "callback")}: {listed(work.silent)}',
+            'give a GRAPH that declares it')
+    if work.silent:
+        warnings.append(
+            f'{run.name}: {counted(len(work.silent), "callback")} never ran in it, and no '
+            f'execution_time is declared, so what-ifs leave out: {listed(work.silent)}')
     if left_out:
         warnings.append(
             f'{run.name}: {counted(left_out, "run")} of undeclared callbacks in processes of '
@@ -301,9 +308,9 @@ def reschedule(
             f'{run.name}: the time in which coroutines waited is left out: '
             + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
     settings = Settings(
-        policy, max(pools), run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
+        policy, pools, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
         judge_from=max(begin, judge_from), judge_until=judge_until,
-        processes=len(pools), on_late=on_late, pools=pools if len(set(pools)) > 1 else ())
+        on_late=on_late)
     with gc_paused():
         return Reschedule(
             run, work, tables, settings, warnings, skip, overheads, placed, recorded)

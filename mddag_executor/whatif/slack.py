@@ -32,6 +32,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from itertools import zip_longest
 import math
 import multiprocessing
 import signal
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
         SlackResult,
     )
     from mddag_executor.results.sinks import DagCounts, Requirements, SinkCounts
+    from msg_graph import Process
 
 MOST, LEAST = 100.0, 0.01
 EXACT = 1.01
@@ -279,22 +281,31 @@ class Search:
             length *= 2
         return None
 
-    def fewer(self, of: str) -> Fewer | None:
+    def fewer_workers(self) -> list[Fewer]:
         """
-        Return the minimum of ``workers`` or ``cpus`` that misses nothing; None: unknown.
+        Return by process the minimum number of workers that misses nothing; empty: unknown.
 
-        If processes have different numbers of workers, it is the largest of them.
+        One process after another is reduced, so all these numbers together miss nothing.
         """
-        problem = self._problem
-        given = getattr(problem.settings, of)
-        if given is None or self.misses:
-            return None
-        least, miss = given, None
+        found, pools = list[Fewer](), self._problem.settings.pools
+        while len(found) < len(pools) and not self.misses:
+            before = [each.least for each in found]
+            given, *rest = pools[len(before):]
+            found.append(self._fewer(given, partial(_pools, before, rest)))
+        return found
+
+    def fewer_cpus(self) -> Fewer | None:
+        """Return the minimum number of CPUs that misses nothing; None: unknown."""
+        given = self._problem.settings.cpus
+        return None if given is None or self.misses else self._fewer(
+            given, lambda least: {'cpus': least})
+
+    def _fewer(self, given: int, setting: Callable[[int], dict[str, Any]]) -> Fewer:
+        """Return the minimum with which nothing is missed, of settings made of a number."""
+        problem, least, miss = self._problem, given, None
         while least > 1 and miss is None:
-            self._problem = problem._replace(settings=replace(
-                problem.settings, **{of: least - 1}, pools=tuple(
-                    min(each, least - 1) if of == 'workers' else each
-                    for each in problem.settings.pools)))
+            self._problem = problem._replace(
+                settings=replace(problem.settings, **setting(least - 1)))
             miss = self.miss(ALL, 1.0)
             if miss is None:
                 least -= 1
@@ -331,13 +342,15 @@ class Slack(NamedTuple):
     :ivar factors: by callback, and of all together (``ALL``).
     :ivar missed: by sink the number of missed deadlines with factor 1.
     :ivar left_out: sinks that miss all of them with any factor.
-    :ivar fewer: of ``workers`` and ``cpus``; None: unknown, or deadlines are missed.
+    :ivar workers: by process the sufficient workers; empty: unknown, or deadlines are missed.
+    :ivar cpus: the sufficient CPUs; None: unknown, or deadlines are missed.
     """
 
     factors: dict[int, Found]
     missed: dict[int, int]
     left_out: list[int]
-    fewer: dict[str, Fewer | None]
+    workers: list[Fewer]
+    cpus: Fewer | None
 
 
 def find_slack(
@@ -364,20 +377,24 @@ def find_slack(
     for callback, one in zip(rest, _factors(search, rest, min(len(rest), jobs))):
         found[callback] = one
         progress(len(found) - 1)
-    return Slack(found, search.missed, search.left_out,
-                 {of: search.fewer(of) for of in ('workers', 'cpus')})
+    return Slack(found, search.missed, search.left_out, search.fewer_workers(),
+                 search.fewer_cpus())
+
+
+def _pools(before: Sequence[int], rest: Sequence[int], workers: int) -> dict[str, Any]:
+    return {'pools': (*before, workers, *rest)}
 
 
 def slack_result(
-    slack: Slack, task_set: TaskSet, dags: Mapping[str, DagCounts], processes: int = 1,
-    requirements: Requirements | None = None,
+    slack: Slack, task_set: TaskSet, dags: Mapping[str, DagCounts],
+    processes: Sequence[Process] = (), requirements: Requirements | None = None,
 ) -> SlackResult:
     """
     Return the result format of ``slack --json``.
 
     :param dags: of the result of the run with factor 1; ``requirements``: its paths, if something
         is required of them.
-    :param processes: number of processes, each with this many workers.
+    :param processes: if there are several; otherwise empty.
     """
     names = [vertex.name for vertex in task_set.vertices]
 
@@ -398,15 +415,19 @@ def slack_result(
 
     result: SlackResult = {
         'most': MOST,
-        'processes': processes,
         'callbacks': {callback.key: shown(slack.factors[i])
                       for i, callback in enumerate(task_set.callbacks) if i in slack.factors},
         'load': shown(slack.factors[ALL]),
-        'workers': enough(slack.fewer['workers']), 'cpus': enough(slack.fewer['cpus']),
+        'workers': enough(slack.workers[0] if slack.workers and not processes else None),
+        'cpus': enough(slack.cpus),
         'missed': {names[sink]: slack.missed[sink] for sink in sorted(slack.missed)},
         'left_out': [names[sink] for sink in slack.left_out],
         'sinks': {name: one for dag in dags.values()
                   for name, one in margins(dag['sinks']).items()}}
+    if processes:
+        result['processes'] = [
+            {'name': process.name, 'workers': enough(fewer)}
+            for process, fewer in zip_longest(processes, slack.workers)]
     if requirements:
         result['requirements'] = {
             name: one for path in as_dags(requirements).values()

@@ -41,7 +41,7 @@ def path_of(callbacks):
 
 
 def simulated_run(task_set):
-    settings = Settings(workers=task_set.workers, duration_ns=600 * MS)
+    settings = Settings(pools=(task_set.workers,), duration_ns=600 * MS)
     load = periodic_workload(task_set, draw_execution_times(task_set, 0), settings.duration_ns)
     run = simulate(task_set, load, settings, log=True)
     return run.result(), ComputedRun.of_run(task_set, load, run)

@@ -235,7 +235,7 @@ def test_an_undeclared_callback_may_hold_the_interpreter(aborted, tmp_path, call
         assert 'no job 10: choose one from 0 to 9' in call('explain', path, '--job', '10').stderr
         # the miss of the earliest deadline is the first one, though another was known before
         assert 'first miss: /x:late, job 0, 36 ms late' in call('replay', path).stdout
-        assert '5 jobs skipped by a timer in the recording: skipped' in call(
+        assert '5 jobs whose first callback did not run in the recording: skipped' in call(
             'replay', path, '--reschedule').stdout
 
 

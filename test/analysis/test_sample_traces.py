@@ -5,7 +5,8 @@ The sample traces in `bags/` and results that have been the same since version 1
 
 But since 2.0.0 the first miss is that of the earliest deadline, some counts are new, and
 undeclared callbacks have no overheads either.  Since 3.0.0 paths follow messages that arrived
-before their callback ended.
+before their callback ended, and an execution that did not complete takes as long as it ran, or
+longer.
 """
 
 import json

@@ -48,7 +48,7 @@ class Case:
     def run(self, horizon, judge='horizon', stop=False, last_release=None):
         """Simulate it; times in ticks."""
         settings = Settings(
-            policy=self.policy, workers=self.workers, duration_ns=horizon * TICK,
+            policy=self.policy, pools=(self.workers,), duration_ns=horizon * TICK,
             preemptive=self.preemptive, judge=judge, stop_at_first_miss=stop,
             dispatch_overhead_ns=self.dispatch_overhead * TICK,
             switch_overhead_ns=self.switch_overhead * TICK)

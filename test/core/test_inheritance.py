@@ -243,7 +243,7 @@ def test_a_simulated_request_goes_before_what_is_less_urgent(compiled):
         times=[0, 1, 2, 3], dags=[0, 2, 2, 2], jobs=[0, 0, 1, 2], costs=[10, 5, 5, 5],
         cost_base=[0, 0, 1], cost_stride=[0, 0, 1], inherited=[NEVER, NEVER, 20 * TICK],
         inherits_from=[0, 0, 0])
-    settings = Settings(policy='rad', workers=1, duration_ns=100, preemptive=False)
+    settings = Settings(policy='rad', pools=(1,), duration_ns=100, preemptive=False)
     run = schedule(Tables.build(TASK_SET), load, settings, log=True, compiled=compiled)
     log = [[int(value) for value in row] for row in run.log]
     assert [row[5] for row in log if row[1] == START and row[3] == 2] == [2, 0, 1]

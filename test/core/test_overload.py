@@ -119,7 +119,7 @@ def case_of(*timers, workers=1, preemptive=False):
 
 def simulated(case, load, horizon, on_late='demote'):
     return simulate(case.task_set, load, Settings(
-        workers=case.workers, duration_ns=horizon * TICK, preemptive=case.preemptive,
+        pools=(case.workers,), duration_ns=horizon * TICK, preemptive=case.preemptive,
         on_late=on_late), log=True)
 
 

@@ -99,7 +99,7 @@ def test_verdicts_are_those_of_simulate(autoware):
         for j, (name, preemptive) in enumerate((('rad', True), ('wc', False))):
             run = simulate(
                 autoware, periodic_workload(autoware, rows, 500_000_000),
-                Settings(name, 7, 500_000_000, preemptive, 'completions'))
+                Settings(name, (7,), 500_000_000, preemptive, 'completions'))
             assert outcome.accepted[j, i] == (not run.tally.missed)
     assert 0 < outcome.accepted.mean() < 1
 

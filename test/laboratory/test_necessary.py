@@ -42,7 +42,7 @@ def missed(task_set, policy, workers):
     times = [[vertex.callback.execution_time.mean_ns for vertex in dag.vertices]
              for dag in task_set.dags]
     run = simulate(task_set, periodic_workload(task_set, times, HORIZON), Settings(
-        policy=policy, workers=workers, duration_ns=HORIZON, preemptive=True,
+        policy=policy, pools=(workers,), duration_ns=HORIZON, preemptive=True,
         stop_at_first_miss=True))
     return bool(run.result()['deadline_missed'])
 

@@ -81,4 +81,4 @@ def simulated(task_set, *, utilisation=0.95, workers=5, ms=300, seed=0, **settin
         task_set, draw_execution_times(task_set, seed), workers, utilisation)
     load = periodic_workload(task_set, times, ms * MS)
     return load, simulate(
-        task_set, load, Settings(workers=workers, duration_ns=ms * MS, **settings), log=True)
+        task_set, load, Settings(pools=(workers,), duration_ns=ms * MS, **settings), log=True)

@@ -65,7 +65,7 @@ def test_jobs_that_are_given_up_and_jobs_by_another_number(tmp_path):
         runs.GRAPH.replace('deadline: 8ms', 'deadline: 8ms, execution_time: 30ms')
         .replace('timer: 10ms', 'timer: 10ms, execution_time: 1ms, max_active_jobs: 2'), 'g.yaml')
     load = periodic_workload(task_set, [[runs.MS, 30 * runs.MS]], 100 * runs.MS)
-    run = simulate(task_set, load, Settings(workers=1, duration_ns=100 * runs.MS), log=True)
+    run = simulate(task_set, load, Settings(pools=(1,), duration_ns=100 * runs.MS), log=True)
     write_trace(tmp_path / 'run.mcap', task_set, load, run)
     seen = ComputedRun(
         task_set, load, run.log, run.decisions, run.ended_ns,

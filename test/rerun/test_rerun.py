@@ -285,7 +285,7 @@ def test_callbacks_start_and_end_as_in_the_simulator(tmp_path, monkeypatch, seed
     task_set = loads(yaml.safe_dump(declared, sort_keys=False))
     simulated = simulate(
         task_set, periodic_workload(task_set, draw_execution_times(task_set, 0), 1000 * MS),
-        SimulatorSettings('rad', workers, 1000 * MS, cpus=cpus, on_late='demote'),
+        SimulatorSettings('rad', (workers,), 1000 * MS, cpus=cpus, on_late='demote'),
         log=True).log
     bag = write_bag(tmp_path / 'in.mcap', [(ms, '/unused', String()) for ms in (0, 1000)])
     monkeypatch.setattr(Durations, 'first_release', lambda times, dag: START)

@@ -32,7 +32,7 @@ EVERY_RULE = cases(overheads=True, importance=True)
 
 def settings_of(case, horizon, judge, stop):
     return Settings(
-        policy=case.policy, workers=case.workers, duration_ns=horizon * TICK,
+        policy=case.policy, pools=(case.workers,), duration_ns=horizon * TICK,
         preemptive=case.preemptive, judge=judge, stop_at_first_miss=stop,
         dispatch_overhead_ns=case.dispatch_overhead * TICK,
         switch_overhead_ns=case.switch_overhead * TICK)
@@ -128,11 +128,11 @@ def test_machine_messages_and_processes(case, horizon, stop, seed):
     one = case.preemptive or case.policy == ROS2
     settings = replace(
         settings_of(case, horizon * SLOW, 'horizon', stop),
-        processes=1 if one else chances.randint(1, 3), cpus=chances.choice([None, 1, 2, 3]))
-    if chances.random() < 0.5 and not one:
+        cpus=chances.choice([None, 1, 2, 3]))
+    if not one:
         settings = replace(settings, pools=tuple(
-            chances.randint(1, 4) for _ in range(settings.processes)))
-    tables = slowed(Tables.build(case.task_set), settings.processes, chances)
+            chances.randint(1, 4) for _ in range(chances.randint(1, 3))))
+    tables = slowed(Tables.build(case.task_set), len(settings.pools), chances)
     load_ = with_everything(case.load(horizon), tables, chances)
     plain, found = (
         schedule(tables, load_, settings, log=True, compiled=compiled)

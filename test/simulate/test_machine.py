@@ -56,8 +56,8 @@ def times(jobs, workers, cpus=None, python=False, preemptive=False, second=0):
         patch.setattr(engine, 'needs_python', lambda load: python)
         log = schedule(
             tables, load, Settings(
-                'rad', workers, 10 ** 12, preemptive, cpus=cpus,
-                pools=(workers, second) if second else ()), log=True, compiled=False).log
+                'rad', (workers, second) if second else (workers,), 10 ** 12, preemptive,
+                cpus=cpus), log=True, compiled=False).log
     found = [(-1, -1)] * n
     for now, kind, _, dag, _, _ in log:
         if kind == START and found[dag][0] < 0:

@@ -80,7 +80,7 @@ def test_autoware_runs_as_in_the_paper_s_program(seed, policy):
     times = [[-(-time // 1000) * 1000 for time in row]
              for row in draw_execution_times(task_set, seed)]
     run = simulate(task_set, periodic_workload(task_set, times, 3 * 10 ** 9), Settings(
-        policy=policy, workers=7, duration_ns=3 * 10 ** 9, preemptive=None,
+        policy=policy, pools=(7,), duration_ns=3 * 10 ** 9, preemptive=None,
         judge='completions', stop_at_first_miss=True))
     worst = {}
     first_miss = None
@@ -98,12 +98,12 @@ def test_autoware_runs_as_in_the_paper_s_program(seed, policy):
 def test_a_source_may_get_ready_after_its_release():
     """As with a header stamp: the deadline counts from the release."""
     load = Workload([5 * US], [0], [0], [2 * US, 2 * US], [0, 2], [0, 0], releases=[1])
-    run = simulate(two_dags(), load, Settings(workers=1, duration_ns=100 * US))
+    run = simulate(two_dags(), load, Settings(pools=(1,), duration_ns=100 * US))
     sink = run.result()['dags']['a']['sinks']['/n:x@a']
     assert (sink['completed'], sink['late']) == (1, 0)
     assert sink['response_ns']['max'] == 9 * US - 1
     late = simulate(two_dags(), load._replace(times=[5 * US + 2]),
-                    Settings(workers=1, duration_ns=100 * US))
+                    Settings(pools=(1,), duration_ns=100 * US))
     assert late.result()['first_miss'] == {
         'dag': 'a', 'vertex': '/n:x@a', 'job': 0, 'deadline_ns': 9 * US + 1,
         'completed_ns': 9 * US + 2}
@@ -114,7 +114,7 @@ def test_the_log_has_releases_and_early_ends_in_the_order_of_the_engine():
     task_set = declaration([{'node': '/n', 'name': 't', 'timer': '10us', 'deadline': '9us',
                              'max_active_jobs': 1, 'execution_time': '25us'}])
     run = simulate(task_set, periodic_workload(task_set, [[25 * US]], 26 * US),
-                   Settings(workers=1, duration_ns=26 * US), log=True)
+                   Settings(pools=(1,), duration_ns=26 * US), log=True)
     assert [*map(tuple, run.log)] == [
         (0, RELEASE, -1, 0, 0, 0), (0, START, 0, 0, 0, 0),
         (10 * US, JOB_ENDED, -1, 0, EXPIRED, 0), (10 * US, RELEASE, -1, 0, 10 * US, 1),
@@ -125,7 +125,7 @@ def test_the_log_has_releases_and_early_ends_in_the_order_of_the_engine():
 def test_a_bound_for_all_dags_and_one_of_its_own():
     task_set = two_dags(max_active_jobs=3)
     load = periodic_workload(task_set, [[1, 900 * US], [900 * US, 1]], 100 * US)
-    settings = Settings(workers=2, duration_ns=100 * US)
+    settings = Settings(pools=(2,), duration_ns=100 * US)
     for more, expired in (({'max_active_jobs': 2}, [10 - 3, 25 - 2]), ({}, [10 - 3, 0])):
         dags = simulate(task_set, load, settings, **more).result()['dags']
         assert [dags[name]['ends']['expired'] for name in 'ab'] == expired
@@ -134,7 +134,7 @@ def test_a_bound_for_all_dags_and_one_of_its_own():
 # --- settings ------------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(('setting', 'says'), [
-    ({'workers': 0}, 'workers: 0 is out of range: give 1 to 4096'),
+    ({'pools': (2, 0)}, 'workers: 0 is out of range: give 1 to 4096'),
     ({'duration_ns': 0}, 'duration: 0 ns is too short'),
     ({'judge': 'me'}, "judge 'me': .*: choose one of horizon, completions"),
     ({'policy': 'ros2', 'preemptive': True}, "policy 'ros2': .* preempts no callback: run it"),
@@ -290,7 +290,7 @@ nodes:
 """, 'g.yaml')
     horizon = 160_000_000
     load_ = periodic_workload(task_set, draw_execution_times(task_set, 0), horizon)
-    run = simulate(task_set, load_, Settings(workers=2, duration_ns=horizon, cpus=cpus), log=True)
+    run = simulate(task_set, load_, Settings(pools=(2,), duration_ns=horizon, cpus=cpus), log=True)
     trace.unlink(missing_ok=True)
     write_trace(trace, task_set, load_, run)
     result = reschedule(trace).result()

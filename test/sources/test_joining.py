@@ -210,9 +210,15 @@ def two(tmp_path):
 def test_each_process_has_its_workers_and_interpreter_again(two, tmp_path, call):
     outcome = reschedule(two)
     assert [(p.name, p.nodes) for p in outcome.processes] == [('up', ('/a',)), ('down', ('/b',))]
-    assert (outcome.workers, outcome.settings.workers) == (4, 2) and not outcome.tally.missed
+    assert (outcome.workers, outcome.settings.pools) == (4, (2, 2)) and not outcome.tally.missed
     assert outcome.worker_names == ['up 0', 'up 1', 'down 0', 'down 1']
     assert reschedule(two, cpus=1).tally.missed
+    slack = 'slack', *two, '--workers', 'up=3'
+    assert call(*slack, '--json', '-').result['processes'] == [
+        {'name': name, 'workers': {'given': given, 'least': 1, 'breaks': None}}
+        for name, given in (('up', 3), ('down', 2))]
+    lines = call(*slack).stdout
+    assert '1 of 3 workers in up is enough\n1 of 2 workers in down is enough\n' in lines
 
     run = call('replay', *two, '--reschedule')
     assert '18 in time' in run.stdout and '4 workers in 2 processes' in run.stdout
@@ -237,7 +243,7 @@ def test_each_process_has_the_number_of_workers_that_it_had(tmp_path, call):
     for given, expected in ((None, (1, 3)), (2, (2, 2)), ({'up': 2}, (2, 3)),
                             ({'down': 1, 'up': 4}, (4, 1))):
         outcome = reschedule(paths, workers=given)
-        assert outcome.settings.workers_of == expected
+        assert outcome.settings.pools == expected
         assert outcome.workers == sum(expected) == len(outcome.worker_names)
         assert [each['workers'] for each in outcome.result()['processes']] == [*expected]
     run = call('replay', *paths, '--reschedule', '--workers', 'down=2')

@@ -41,7 +41,7 @@ def write_two(path, **settings):
     load = Workload([0, 5 * MS, 15 * MS], [0, 1, 1], [0, 0, 1], [12 * MS, 2 * MS, 2 * MS], [0, 1],
                 [1, 1])
     task_set = loads(TWO, 'two.yaml')
-    settings = Settings(**{'workers': 2, 'duration_ns': 20 * MS, **settings})
+    settings = Settings(**{'pools': (2,), 'duration_ns': 20 * MS, **settings})
     write_trace(path, task_set, load, simulate(task_set, load, settings, log=True))
     return path
 
@@ -63,7 +63,7 @@ def test_policy_workers_and_preemption_are_those_asked_for(tmp_path):
     assert fifo['deadline_missed']
     assert fifo['utilisation'] == pytest.approx(16 / 20)
     # a preemptive run stays one
-    path = write_two(tmp_path / 'b.mcap', workers=1, preemptive=True)
+    path = write_two(tmp_path / 'b.mcap', pools=(1,), preemptive=True)
     for how, late in (({}, False), ({'preemptive': False}, True), ({'policy': 'ros2'}, True)):
         result = reschedule(path, **how).result()
         assert result['deadline_missed'] == late
@@ -124,10 +124,63 @@ def test_what_was_not_recorded_takes_the_median_then_the_declared_mean(tmp_path)
     assert took == {(1, 0): MS, (1, 1): 3 * MS, (1, 2): 2 * MS, (1, 3): 2 * MS, (0, 0): 7 * MS}
     result = outcome.result()
     assert (result['executions'], result['estimated_executions']) == (5, 2)
-    with pytest.raises(ReplayError, match=(
-            'a.mcap: 1 callback did not complete in it, and no execution_time is declared: '
-            '/slow:cb: give a GRAPH')):
-        reschedule(trace.path, loads(TWO, 'g.yaml'))
+
+
+FORKED = """\
+mddag: 1
+nodes:
+  - {node: /a, callbacks: [{name: cb, timer: 10ms, publishes: [/x], dag: chain}]}
+  - {node: /b, callbacks: [{name: cb, subscription: /x, publishes: [/y]}]}
+  - {node: /c, callbacks: [{name: cb, subscription: /y, deadline: 5ms}]}
+  - {node: /d, callbacks: [{name: cb, subscription: /x, deadline: 5ms}]}
+  - {node: /e, callbacks: [{name: cb, timer: 20ms, deadline: 9ms, dag: other}]}
+"""
+
+
+def test_what_never_ran_does_not_run(tmp_path, call):
+    """The rest is scheduled: `/d` has its results, `/c` has none, as in the recording."""
+    trace = Written(tmp_path / 'a.mcap', FORKED, 2)
+    for job in range(4):
+        trace.release(0, job, job * 10)
+        trace.run(0, 0, job, job * 10, job * 10 + 1)
+        trace.run(0, 3, job, job * 10 + 1, job * 10 + 3)
+    trace.release(1, 0, 0)
+    path = trace.end(60)
+    outcome = reschedule(path)
+    assert {vertex for _, (_, _, _, _, vertex, _) in executions(outcome.log)} == {0, 3}
+    dags = outcome.result()['dags']
+    assert dags['other']['ends']['expired'] == 1
+    assert outcome.result()['skipped_jobs'] == 1
+    counts = {name: sink['completed'] for name, sink in dags['chain']['sinks'].items()}
+    assert counts == {'/c:cb': 0, '/d:cb': 4}
+    assert (f'{path}: 3 callbacks never ran in it, and no execution_time is declared, so '
+            'what-ifs leave out: /b:cb, /c:cb, /e:cb') in outcome.warnings
+    result = call('slack', path, '--json', '-').result
+    assert result['left_out'] == ['/c:cb', '/e:cb']
+    assert 1.99 <= result['callbacks']['/d:cb']['factor'] <= 2      # 2 of 4 ms
+
+
+def test_what_did_not_complete_takes_as_long_as_it_ran_or_longer(tmp_path):
+    """A callback hangs, another one only failed, and the last execution of a third is open."""
+    trace = Written(tmp_path / 'a.mcap', FORKED, 4)
+    for job, took in enumerate((1, 1, 1, 0)):
+        trace.release(0, job, job * 10)
+        if took:
+            trace.run(0, 0, job, job * 10, job * 10 + took)
+    trace.add('dispatch', 30, 1000, 0, 0, 3, 0, ns(30), 0, thread=10)
+    trace.add('callback_start', 30, 1000, False, thread=10)
+    trace.add('dispatch', 5, 1001, 0, 1, 0, 1, ns(1), 0, thread=11)
+    trace.add('callback_start', 5, 1001, False, thread=11)
+    trace.piece(0, 3, 0, 1, 5, worker=2)
+    trace.add('fail', 5, 0, 3, 0)
+    outcome = reschedule(trace.end(70))
+    load = outcome.work.load
+    first = load.cost_base[0]
+    took = [[cost // MS for cost in load.costs[first + job * 4:first + job * 4 + 4]]
+            for job in range(4)]
+    assert [row[0] for row in took] == [1, 1, 1, 40]
+    assert [row[1] for row in took] == [65] * 4
+    assert not [line for line in outcome.warnings if '/b:cb' in line]
 
 
 def test_pieces_are_added_up_and_legs_are_not(tmp_path):

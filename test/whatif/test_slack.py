@@ -161,7 +161,7 @@ def test_a_callback_that_does_not_help_costs_one_short_run(monkeypatch):
         f'  - {{node: /n{i}, callbacks: [{{name: t, timer: 10ms, deadline: 9ms, '
         'execution_time: 1ms}]}\n' for i in range(20))
     task_set = loads('mddag: 1\nworkers: 1\nnodes:\n' + nodes, 'g.yaml')
-    settings = Settings(policy='rad', workers=1, duration_ns=2_000 * MS)
+    settings = Settings(policy='rad', pools=(1,), duration_ns=2_000 * MS)
     load = periodic_workload(task_set, [[MS]] * 20, settings.duration_ns)
     lengths = []
 
