@@ -16,19 +16,22 @@ if TYPE_CHECKING:
 
 
 def recorded_callbacks(recording: Recording) -> dict[str, RecordedCallback]:
-    """Return counts and times (ns) of each recorded callback that ran."""
+    """Return by label counts and times (ns) of the recorded callbacks that ran."""
     start, end, piece = (recording.executions[name] for name in ('start', 'end', 'piece'))
     numbers, index = different(recording.executions['callback'])
-    found: dict[tuple[str, int], RecordedCallback] = {}
-    for number, mine in zip(numbers.tolist(), rows_by(index, len(numbers))):
+    labels, which = np.unique(np.array(
+        [recording.names.name(number) for number in numbers.tolist()], dtype=np.str_),
+        return_inverse=True)
+    found: dict[str, RecordedCallback] = {}
+    for label, mine in zip(labels.tolist(), rows_by(which[index], len(labels))):
         ended = mine[end[mine] >= 0]
         took = end[ended] - start[ended]
-        found[recording.names.name(number), number] = {
+        found[label] = {
             # a coroutine that waited is one execution
             'executions': int((piece[ended] == 0).sum()), 'unfinished': len(mine) - len(took),
             'busy_ns': sum_of(took), 'shortest_ns': int(took.min()) if len(took) else 0,
             'longest_ns': max(0, int(took.max(initial=0)))}
-    return {label: each for (label, _), each in sorted(found.items(), key=lambda item: item[0])}
+    return found
 
 
 def communications(recording: Recording) -> list[Communication]:

@@ -21,11 +21,9 @@ Theory of operation
 5. A service without calls, and a subscription without messages whose topic no callback publishes,
    have no rate, so they cannot be the source of a DAG.  They are left out and reported, and take
    no name from those that ran.  So is a timer that never fired in ``NEVER_PERIODS`` periods.
-6. A timer that was made after another one of its node, with the same period and function, had
-   fired, or that never fired although a period had passed (it was destroyed or cancelled before),
-   is the same callback, made again (``sporadic``).  So is a timer that was reset: its due
-   times are not whole periods apart, or the only one is much later than a period after it was
-   made.
+6. A timer that was made again (``recording.timers``) is one callback, and ``sporadic``.  So is a
+   timer that was reset: its due times are not whole periods apart, or the only one is much later
+   than a period after it was made.
 7. Subscriptions of a node are one sync (``_find_syncs``) if the messages that they publish have
    the header stamps of several of their topics, or are as many as the messages of one of them.
 8. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
@@ -46,6 +44,7 @@ from mddag_executor.recording.mapping import declared_keys
 from mddag_executor.recording.names import Callback, KINDS
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
+from mddag_executor.recording.timers import is_overdue, made_again
 from mddag_executor.sources.open import open_to_draft, Traces
 from mddag_executor.sources.progress import Progress
 from msg_graph import Callback as Declared
@@ -75,8 +74,6 @@ NEVER_PERIODS = 20
 """A timer never fires if a recording of this many periods has no execution of it."""
 RESET_SHARE = 0.1
 """A timer was reset if a larger share of its due times are off its period."""
-_MADE_NS = 50_000_000
-"""When a timer was made is recorded this much earlier or later at most."""
 LEAST_COPIED = 5
 """From fewer messages with header stamps nothing is concluded."""
 _NO_STAMPS: Ints = np.empty(0, dtype=np.int64)
@@ -174,19 +171,25 @@ class System:
                     self._publishers[known.node.name][known.topic] = True
 
     def _join_timers(self) -> None:
-        """Join each timer with those that were made again after it had fired (rule 6)."""
-        first: dict[tuple[str, int, str], Callback] = {}
-        for entity in [each for each in self._entities if each.kind == 'timer']:
+        """Join each timer with those that are the same callback (rule 6)."""
+        timers = [each for each in self._entities if each.kind == 'timer']
+        last = {number: int(runs.starts.max()) for number, runs in self._runs.items()
+                if len(runs.starts)}
+        again = [*made_again(
+            [each for each in timers if each.number not in self._declared], last, self._end)]
+        first: dict[str, Callback] = {}
+        for entity in timers:
             declared = self._declared.get(entity.number)
-            if declared is not None and not declared.sporadic:
-                continue
-            before = first.setdefault((
-                entity.node_name, entity.period if declared is None else 0,
-                entity.symbol if declared is None else declared.name), entity)
+            if declared is not None and declared.sporadic:
+                before = first.setdefault(declared.key, entity)
+                if before is not entity:
+                    again.append((entity, before))
+        self._join(again)
+
+    def _join(self, pairs: list[tuple[Callback, Callback]]) -> None:
+        """Make one callback of those of each pair: the second one, which was made first."""
+        for entity, before in pairs:
             runs, again = (self._runs.get(each.number) for each in (before, entity))
-            if before is entity or declared is None and (
-                    not entity.symbol or not self._was_gone(before, entity.made)):
-                continue
             self._entities.remove(entity)
             self._made_again.add(before.number)
             if runs is not None and again is not None:
@@ -198,13 +201,6 @@ class System:
                         for topic in {**runs.published, **again.published}})
             if again is not None:
                 self._runs[before.number] = again
-
-    def _was_gone(self, timer: Callback, at: int) -> bool:
-        """Return whether a timer had ended, or had been cancelled, before a time (rule 6)."""
-        runs = self._runs.get(timer.number)
-        if runs is not None and len(runs.starts):
-            return at > int(runs.starts.max())
-        return self._end - timer.made > (1 + RESET_SHARE) * timer.period + _MADE_NS
 
     def _is_silent(self, entity: Callback) -> bool:
         """Return whether an entity may be left out because it never ran (rule 5)."""
@@ -581,8 +577,8 @@ def _was_reset(timer: Callback, due: Ints) -> bool:
         return False
     _, is_whole = whole_periods(due, timer.period)
     off = int((~is_whole).sum())
-    return off > max(1, RESET_SHARE * len(is_whole)) or len(due) == 1 and (
-        int(due[0]) - timer.made > (1 + RESET_SHARE) * timer.period + _MADE_NS)
+    return off > max(1, RESET_SHARE * len(is_whole)) or (
+        len(due) == 1 and is_overdue(timer, int(due[0])))
 
 
 def execution_time(took: Ints) -> tuple[ExecutionTime, int] | None:

@@ -240,6 +240,7 @@ class Matching:
         self.target = matches(names, judge)
         found = {target.callback.key for target in self.target.values()}
         self.losses += report_missing(
-            name, judge, found, [c.label for c in names.callbacks if c.kind != 'service'],
+            name, judge, found, list(dict.fromkeys(
+                c.label for c in names.callbacks if c.kind != 'service')),
             [c.entity for c in names.callbacks
              if c.entity is not None and c.number not in self.target])

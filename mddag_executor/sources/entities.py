@@ -17,7 +17,7 @@ Theory of operation
    communication within a process rclcpp adds a second one; both are one callback here.
 4. A callback is described by its node and its trigger: timer and period, subscription and topic,
    service and name.  Callbacks of a node with the same description are numbered in the order of
-   creation.
+   creation.  A timer that was made again (``recording.timers``) has the label of the first one.
 5. In an imported recording initialisation events may be anywhere, so they are all read first
    (``read``), and callbacks are numbered.  This executor records them before it refers to them, so
    they are processed one by one (``take``), and a callback's number is its address.
@@ -26,7 +26,7 @@ Theory of operation
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from mddag_executor.recording.names import Address, Callback, KINDS, Names, Node, Publisher
@@ -160,7 +160,7 @@ class Entities:
         for name in (*_INIT, *_GROUPS, _PROGRAM):
             for fields in sorted(by_kind.get(name, ()), key=lambda f: f['_timestamp']):
                 self._one(name, fields)
-        self._label()
+        self.label({})
 
     def _one(self, name: str, f: Fields) -> None:
         """Note a complete event."""
@@ -249,10 +249,19 @@ class Entities:
             callback.group = group[0] if group[1] else -1
             self.names.groups[callback.number] = callback.group
 
-    def _label(self) -> None:
-        """Give callbacks unique labels."""
+    def label(self, first: Mapping[int, Callback]) -> None:
+        """
+        Give the callbacks of timers, subscriptions and services unique labels.
+
+        :param first: by number of a timer that was made again: the first one, whose label it has.
+        """
         used: dict[str, int] = {}
         for callback in sorted(self.names.callbacks, key=lambda c: (c.made, c.number)):
+            if callback.kind not in KINDS:
+                continue
+            if callback.number in first:
+                callback.label = first[callback.number].label
+                continue
             description = callback.description
             number = used[description] = used.get(description, 0) + 1
             callback.label = description if number == 1 else f'{description} #{number}'

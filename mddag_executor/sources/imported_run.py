@@ -40,6 +40,7 @@ from mddag_executor.recording.mapping import Matching
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import Columns, EXECUTIONS, PUBLICATIONS, TAKES, UNKNOWN
+from mddag_executor.recording.timers import made_again
 from mddag_executor.sources.entities import Entities, INIT_EVENTS
 from mddag_executor.sources.executions import unfinished_rows
 from mddag_executor.sources.head import damage, named_errors, no_jobs, no_run
@@ -154,6 +155,7 @@ class ImportedRun:
         jobs.fill(table, release, last, self._skipped(jobs))
         self._number_pieces(table)
         unfinished, places = self._end_unfinished(table)
+        self._label_timers(table)
         run = Run(
             self.name, self.head, self.task_set, self.task_set, declared=False,
             imported=self._imported, same=False,
@@ -171,6 +173,17 @@ class ImportedRun:
             releases=jobs.releases, executions=table, publications=self._publications(),
             job_ends=jobs.ends, takes=self._takes(), unfinished=unfinished), names))
         return replace(found, missing=Losses(self._missing(found)))
+
+    def _label_timers(self, table: Table) -> None:
+        """Give timers that were made again one label."""
+        numbers, index = different(table['callback'])
+        last = np.zeros(len(numbers), dtype=np.int64)
+        np.maximum.at(last, index, table['start'])
+        timers = [each for each in self.who.names.callbacks if each.kind == 'timer']
+        again = made_again(
+            sorted(timers, key=lambda each: (each.made, each.number)),
+            dict(zip(numbers.tolist(), last.tolist())), self.end)
+        self.who.label({timer.number: first for timer, first in again})
 
     def _last_times(self) -> Iterator[int]:
         """Yield times at which it still ran."""

@@ -250,6 +250,27 @@ def test_a_timer_that_was_destroyed_before_it_fired_is_made_again(tmp_path):
     assert (tick.name, tick.period_ns, tick.sporadic) == ('tick', 100 * MS, True)
 
 
+def test_a_timer_that_was_made_again_is_one_row(tmp_path, call):
+    """Two functions make a timer for each shot; a third one has two timers at a time."""
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(100, '/driver')
+    for k, symbol in enumerate(['fast', 'slow'] * 10 + ['both'] * 2):
+        timer = 10 + k
+        made = 100 * MS * k if symbol != 'both' else 5_000 * MS
+        r.timer(timer, 100, 10 * MS, time=made)
+        r.add('ros2:rclcpp_callback_register', made, 1, timer, symbol)
+        ran(r, timer, k, made + 10 * MS, MS)
+    path = r.write()
+    rows = replay(path).result()['recorded_callbacks']
+    assert {name: row['executions'] for name, row in rows.items()} == {
+        '/driver timer 10ms': 10, '/driver timer 10ms #2': 10,
+        '/driver timer 10ms #3': 1, '/driver timer 10ms #4': 1}
+    page, folder = tmp_path / 'r.html', tmp_path / 'tables'
+    call('replay', path, '--report', page)
+    assert 'timer 10ms #4' in page.read_text() and 'timer 10ms #5' not in page.read_text()
+    call('export', path, '-o', f'{folder}/')
+
+
 @pytest.mark.parametrize('symbol, name', [
     ('robot.Driver.tick', 'tick'), ('robot.make.<locals>.<lambda>', 'callback_0')])
 def test_what_never_ran_takes_no_name_from_what_did(tmp_path, symbol, name):
