@@ -256,10 +256,8 @@ def _chain(links: list[int], first: int, most: int) -> list[int]:
 def broken_deadlines(deadlines):
     """Yield a sentence for each invariant of the deadlines of open jobs that does not hold."""
     t, s = deadlines._rule
-    if deadlines.next != (deadlines._heap[0][0] if deadlines._heap else NEVER):
-        yield f'the next deadline is not {deadlines.next}'
     for slot, judged in deadlines._judged.items():
-        if s.job_state[slot] == OPEN:
+        if s.job_state[slot] == OPEN and slot not in deadlines._new:
             time = next_deadline(t, s, slot, judged)
             if deadlines._entry.get(slot, NEVER) > time:
                 yield f'no timer is set for the deadline {time} of the job in slot {slot}'

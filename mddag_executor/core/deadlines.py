@@ -3,15 +3,16 @@
 """
 The deadlines of open jobs, for drivers with a clock: a miss is known when it happens (rule 6).
 
-A driver asks for the next deadline, and calls ``judge`` after it.  Each slot has one entry in a
-heap, for the next deadline of its job.  A job that ends leaves its entry behind.  It is removed
-when it comes first while the slot is free (``first``); else it may be too early for the slot's
-next job, and is replaced when its time has come.
+A driver asks for the next deadline before it waits (``first``), and calls ``judge`` after it.
+Most jobs end before that, so a new job is only noted until then.  After that, its slot has one
+entry in a heap, for the next deadline of its job.  A job that ends leaves its entry behind.  It is
+removed when it comes first while the slot is free; else it may be too early for the slot's next
+job, and is replaced when its time has come.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 from heapq import heappop, heappush
 from itertools import pairwise
 
@@ -24,12 +25,15 @@ class Deadlines:
     """
     Finds the sinks that have not completed by their deadlines, each of them once.
 
-    :ivar next: a time at or before the next deadline; ``NEVER`` if there is none.
+    :ivar watch: ``watch(slot)`` watches the job that was just released in a slot.
     """
 
     def __init__(self, t: Tables, s: State) -> None:
         self._rule = t, s
         self._state = s
+        # slots of jobs that were released since the heap was last used
+        self._new: set[int] = set()
+        self.watch: Callable[[int], None] = self._new.add  # a method would be one more call
         self._heap: list[tuple[int, int]] = []
         # by slot: the time of its entry, and until when its job was judged
         self._entry: dict[int, int] = {}
@@ -38,14 +42,6 @@ class Deadlines:
         self._least = [
             min((t.sink_deadline[each] for each in t.sinks[first:last]), default=NEVER)
             for first, last in pairwise(t.first_sink)]
-        self.next = NEVER
-
-    def watch(self, slot: int) -> None:
-        """Watch the job that was just released in a slot."""
-        state = self._state
-        self._judged[slot] = -NEVER
-        # it is too early, and replaced then, if that sink is in another process
-        self._add(slot, state.job_release[slot] + self._least[state.job_dag[slot]])
 
     def judge(self, now: int, later: Container[int] = ()) -> None:
         """
@@ -53,6 +49,7 @@ class Deadlines:
 
         :param later: the slots of jobs that are not judged yet.
         """
+        self._add_new()
         heap = self._heap
         kept = []
         while heap and heap[0][0] < now:
@@ -70,20 +67,32 @@ class Deadlines:
                 self._add(slot, next_deadline(*self._rule, slot, now - 1))
         for entry in kept:
             heappush(heap, entry)
-        self.next = heap[0][0] if heap else NEVER
 
     def first(self) -> int:
-        """Return ``next``, after the entries of ended jobs that come first were removed."""
+        """
+        Return a time at or before the next deadline; ``NEVER`` if there is none.
+
+        What comes first is of an open job.
+        """
+        self._add_new()
         heap, states = self._heap, self._state.job_state
         while heap and states[heap[0][1]] != OPEN:
             time, slot = heappop(heap)
             if self._entry.get(slot) == time:
                 del self._entry[slot]
-            self.next = heap[0][0] if heap else NEVER
-        return self.next
+        return heap[0][0] if heap else NEVER
+
+    def _add_new(self) -> None:
+        """Add entries for the new jobs that have not ended meanwhile."""
+        state = self._state
+        for slot in self._new:
+            if state.job_state[slot] == OPEN:
+                self._judged[slot] = -NEVER
+                # it is too early, and replaced then, if that sink is in another process
+                self._add(slot, state.job_release[slot] + self._least[state.job_dag[slot]])
+        self._new.clear()
 
     def _add(self, slot: int, time: int) -> None:
         if time < self._entry.get(slot, NEVER):
             self._entry[slot] = time
             heappush(self._heap, (time, slot))
-            self.next = self._heap[0][0]

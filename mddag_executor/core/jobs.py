@@ -26,6 +26,7 @@ from mddag_executor.core.state import (
     OPEN,
     OTHER_KEYS,
     OUTDATED,
+    set_ending,
     SINK_ABORTED,
     SINK_DROPPED,
     SINK_IN_TIME,
@@ -112,10 +113,11 @@ def expect(t: Tables, s: State, dag: int, here: list[int]) -> None:
         if here[i] == 0:
             s.expected[first + i] = ELSEWHERE
             s.partial[dag] = 1
-            continue
-        for e in range(t.first_successor[first + i], t.first_successor[first + i + 1]):
-            if here[t.successors[e] - first] == 0:
-                s.expected[first + i] = LEADS_OUT
+        else:
+            for e in range(t.first_successor[first + i], t.first_successor[first + i + 1]):
+                if here[t.successors[e] - first] == 0:
+                    s.expected[first + i] = LEADS_OUT
+        set_ending(t, s, first + i)
 
 
 def _leave_out(t: Tables, s: State, slot: int) -> None:

@@ -175,6 +175,7 @@ from mddag_executor.core.state import (
     DONE,
     DROP,
     DROPPED,
+    ENDS,
     FAILED,
     IDLE,
     LATE,
@@ -185,6 +186,7 @@ from mddag_executor.core.state import (
     OPEN,
     ORDER,
     OUTDATED,
+    PARTS,
     PLACED,
     PROPAGATE,
     QueueEntry,
@@ -555,23 +557,38 @@ def complete(t: Tables, s: State, key: KeyFunction, x: int, now: int) -> bool:
         s.undeclared.append(x)
         return True
     slot = s.x_slot[x]
-    head = s.job_base[slot] + t.region_offset[vertex]
-    driven = t.driven[vertex]
     whole = True
-    if s.scalars[PROPAGATE] == 0:
-        if driven & DRIVEN != 0:
-            whole = False  # the driver says which execution answers
-        elif t.n_predecessors[vertex] > 0:
-            pending = s.x_pending[head] = s.x_pending[head] - 1
-            whole = pending == 0
-    if whole:
-        s.x_pending[head] = -1
-        if s.job_state[slot] == OPEN:
-            _complete_vertex(t, s, key, slot, vertex, now)
+    ending = s.ending[vertex]
+    if ending == PARTS:
+        whole = _complete_part(t, s, key, slot, vertex, now)
+    elif s.x_pending[x] < 0:
+        whole = False  # it was known not to be due
+    else:
+        s.x_pending[x] = -1
+        if ending == ENDS and s.job_state[slot] == OPEN:
+            _end_in(t, s, slot, vertex, now)
     active = s.job_active[slot] = s.job_active[slot] - 1  # not deactivate(): one call less
     if active == 0 and s.job_state[slot] != OPEN:
         free_slot(s, slot)
     return whole
+
+
+def _complete_part(
+    t: Tables, s: State, key: KeyFunction, slot: int, vertex: int, now: int
+) -> bool:
+    """Note that an execution of a vertex has ended; return whether the vertex has completed."""
+    head = s.job_base[slot] + t.region_offset[vertex]
+    if s.scalars[PROPAGATE] == 0:
+        if t.driven[vertex] & DRIVEN != 0:
+            return False  # the driver says which execution answers
+        if t.n_predecessors[vertex] > 0:
+            pending = s.x_pending[head] = s.x_pending[head] - 1
+            if pending != 0:
+                return False
+    s.x_pending[head] = -1
+    if s.job_state[slot] == OPEN:
+        _complete_vertex(t, s, key, slot, vertex, now)
+    return True
 
 
 def answer(

@@ -30,6 +30,11 @@ FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 # Where a vertex is expected to run; LEADS_OUT: here, and a successor is not.
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
+# What the end of an execution means for its vertex (``ending``).  NOTHING: the vertex has
+# completed, and nothing follows from that here; ENDS: it ends in the job (``jobs.end_in``);
+# PARTS: there is more to find out (``rules._complete_part``).
+NOTHING, ENDS, PARTS = range(3)
+
 # Columns of ``scalars``.  ``FORGET_AT``: until when no measured execution time is too old.
 (ORDER, N_IDLE, PROPAGATE, JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY, FORGET_AT,
  N_SCALARS) = range(10)
@@ -110,6 +115,9 @@ class State(NamedTuple):
     # whether some of its vertices are not expected here; by vertex: whether it is (see ``expect``)
     partial: list[int]
     expected: list[int]
+    # by vertex: what the end of an execution means (``NOTHING``, …), which follows from the tables
+    # and ``expected``
+    ending: list[int]
     # by vertex: how long after its release an execution is checked when it comes first (see
     # ``overload``; NEVER: not); the known mean execution time, and whether it holds the
     # interpreter; when that time was measured last, or -1: it is the declared one
@@ -217,6 +225,8 @@ def fill_state(
         s.measured_at.append(-1)
         s.expected.append(HERE)
         s.process.append(1)
+        s.ending.append(PARTS)
+        set_ending(t, s, v)
     for i in range(len(t.reach_start)):
         s.reach_by.append(t.reach_start[i])
     add_process(s, 0)
@@ -233,6 +243,19 @@ def fill_state(
         s.newest.append(-1)
         s.n_open.append(0)
         s.partial.append(0)
+
+
+def set_ending(t: Tables, s: State, vertex: int) -> None:
+    """Set what the end of an execution means for its vertex."""
+    is_inner = t.first_successor[vertex] < t.first_successor[vertex + 1]
+    propagate = s.scalars[PROPAGATE]
+    if (t.n_legs[vertex] > 1 or s.expected[vertex] == ELSEWHERE
+            or propagate == 0 and t.driven[vertex] != 0 or propagate == 1 and is_inner):
+        s.ending[vertex] = PARTS
+    elif t.sink_deadline[vertex] >= 0 or s.expected[vertex] == LEADS_OUT:
+        s.ending[vertex] = ENDS
+    else:
+        s.ending[vertex] = NOTHING
 
 
 def add_slot(t: Tables, s: State, dag: int) -> None:

@@ -25,7 +25,6 @@ from mddag_executor.core.state import (
     NOT_JUDGED,
     OUTDATED,
     SINK_ABORTED,
-    SINK_COMPLETED,
     SINK_DEMOTED,
     SINK_DROPPED,
     SINK_EXPIRED,
@@ -176,8 +175,10 @@ class SinkTally:
         """Count a completion."""
         self.numbers[SINK_LATE if late else SINK_IN_TIME] += 1
         self.responses.append(response)
-        self.shortest = min(self.shortest, response)
-        self.longest = max(self.longest, response)
+        if response < self.shortest:
+            self.shortest = response
+        if response > self.longest:
+            self.longest = response
 
     def verdicts(self) -> SinkVerdicts:
         """Return the number of each verdict; ``late`` includes the overdue."""
@@ -239,24 +240,30 @@ class Tally:
     def add(self, decisions: Iterable[Decision]) -> None:
         """Count decisions of the core."""
         for kind, dag, vertex, job, deadline, time in decisions:
-            if kind == JOB_END:
-                if self.overdue:  # of a job that is no longer judged
-                    for sink_vertex in self._sinks_of(dag):
-                        self._end_overdue(sink_vertex, job)
+            if self.overdue and kind <= JOB_END:
+                # a verdict, or the end of a job of which some sinks are no longer judged
+                for sink_vertex in self._sinks_of(dag) if kind == JOB_END else (vertex,):
+                    self._end_overdue(sink_vertex, job)
+            if kind == SINK_IN_TIME:
+                sink = self.sinks[vertex]
+                sink.done(time - deadline + sink.relative_deadline_ns, False)
+            elif kind == JOB_END:
                 if vertex != NOT_JUDGED:
                     self.ends[dag][deadline] += 1
             elif kind != DROP:
-                sink = self.sinks[vertex]
-                if self.overdue and kind < JOB_END:
-                    self._end_overdue(vertex, job)
-                if kind in SINK_COMPLETED:
-                    sink.done(time - deadline + sink.relative_deadline_ns, kind == SINK_LATE)
-                else:
-                    sink.numbers[kind] += 1
-                if kind == SINK_OVERDUE:
-                    self.overdue[vertex, job] = deadline
-                elif is_miss(kind):
-                    self._add_miss(vertex, job, deadline, time if kind == SINK_LATE else None)
+                self._add_unusual(kind, vertex, job, deadline, time)
+
+    def _add_unusual(self, kind: int, vertex: int, job: int, deadline: int, time: int) -> None:
+        """Count a decision about a sink that was not in time."""
+        sink = self.sinks[vertex]
+        if kind == SINK_LATE:
+            sink.done(time - deadline + sink.relative_deadline_ns, True)
+        else:
+            sink.numbers[kind] += 1
+        if kind == SINK_OVERDUE:
+            self.overdue[vertex, job] = deadline
+        elif is_miss(kind):
+            self._add_miss(vertex, job, deadline, time if kind == SINK_LATE else None)
 
     def add_results(self, parts: Iterable[tuple[Any, ...]]) -> None:
         """

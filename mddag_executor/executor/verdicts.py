@@ -94,17 +94,20 @@ class Verdicts:
         """Count decisions of the core; return the executions that it dropped."""
         dropped = []
         for kind, dag, vertex, job, deadline, time in decisions:
-            if kind == DROP:
+            if kind == SINK_IN_TIME:
+                continue
+            if kind == JOB_END:
+                if self.on_end is not None or self.record is not None:
+                    self._ended(dag, job, deadline, now)
+            elif kind == DROP:
                 dropped.append(deadline)
-            elif kind == JOB_END:
-                self._ended(dag, job, deadline, now)
             elif kind == SINK_OVERDUE:
                 self._report(kind, dag, vertex, job, deadline, None)
             elif kind == SINK_DEMOTED:
                 if self.record is not None:
                     self.record('demote', now, threading.get_native_id(), dag,
                                 self._tables.index_in_dag[vertex], job)
-            elif kind not in (SINK_IN_TIME, SINK_NOT_DUE):
+            elif kind != SINK_NOT_DUE:
                 self._missed(kind, dag, vertex, job, deadline, time, now)
         self.tally.add(decisions)  # last: it knows which sinks were overdue before
         return dropped
@@ -151,7 +154,7 @@ class Verdicts:
     def released(self, dag: int, job: int, release: int, now: int, judged: bool) -> None:
         """Note that a job was released."""
         if judged:
-            self.tally.released(dag)
+            self.tally.jobs[dag] += 1
         if self.on_release is not None:
             self.on_release(dag, release)
         if self.record is not None:

@@ -909,7 +909,8 @@ BREAKS = {
         e._state.job_dag.index(0), 9)),
     'open jobs': ('jobs of DAG 0 are open', lambda e: e._state.n_open.__setitem__(0, 0)),
     'bypass': ('bypass the core', lambda e: setattr(e._bypass, 'is_open', True)),
-    'deadline': ('next deadline', lambda e: setattr(e.deadlines, 'next', 5)),
+    'deadline': ('no timer is set', lambda e: (
+        e.deadlines.first(), e.deadlines._entry.clear())),
 }
 
 
