@@ -13,10 +13,14 @@ Theory of operation
     them does the rest.
 3.  Therefore nothing that a thread refers to may refer to the executor: threads would keep it
     alive.  They have its methods by ``weakly.weakly``.
+4.  Objects that were exempted from garbage collection (``freeze_gc``) are collected again.  Else
+    nodes in reference cycles would never be destroyed, even at the end of the interpreter: other
+    processes would wait for them, and with Kilted the middleware's shared memory would stay.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import select
 import sys
@@ -64,7 +68,14 @@ class Ending:
         # reentrant: a signal handler may end the run in the thread that is ending it
         self._lock = threading.RLock()
         self._has_ended = False
+        self._has_frozen = False
         self._pid = os.getpid()
+
+    def freeze_objects(self) -> None:
+        """Collect garbage, and exempt all objects from later collections until the run ends."""
+        self._has_frozen = True
+        gc.collect()
+        gc.freeze()
 
     def end_run(self) -> None:
         """Judge open jobs and close the trace, once; a second thread waits for the first."""
@@ -74,6 +85,8 @@ class Ending:
                 self._judge_and_close()
 
     def _judge_and_close(self) -> None:
+        if self._has_frozen:
+            gc.unfreeze()
         for each in (self.diagnostics, self.wait_sets):
             if each is not None:
                 each.stop()

@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-import gc
 import math
 import os
 import select
@@ -137,7 +136,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
     :param freeze_gc: when the first spin begins, collect garbage and exempt all existing objects
-        from later collections (``gc.freeze``): for programs that make their nodes first.
+        from later collections (``gc.freeze``) until the executor ends: for programs that make
+        their nodes first.
     :param diagnostics_period: how often to publish on ``/diagnostics`` during a spin: as
         ``default_deadline``; None or 0: never.
     :param thresholds: the limits beyond which a status of the diagnostics is worse than OK.
@@ -533,8 +533,7 @@ class MultiDeadlineExecutor(BareExecutor):
             return
         if self._freeze_gc:
             self._freeze_gc = False
-            gc.collect()
-            gc.freeze()
+            self._ending.freeze_objects()
         self._submit_tasks()  # as in rclpy, before other ready callbacks
         self._upkeep.refresh()
         self._start_threads()

@@ -14,7 +14,6 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext, redirect_
 from dataclasses import asdict, dataclass
 import faulthandler
 from functools import partial
-import gc
 import signal
 from typing import Any, NoReturn, Protocol, TextIO
 
@@ -118,8 +117,6 @@ def run_here(
     plan = plan_of(options, task_set)
     with ExitStack() as stack:
         stack.callback(faulthandler.cancel_dump_traceback_later)
-        if display.leave is None:
-            stack.callback(gc.unfreeze)
         signals = stack.enter_context(Signals(ends_process=display.leave is not None))
         stack.enter_context(initialised(options.ros_args))
         programs: list[Program] = []

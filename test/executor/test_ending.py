@@ -82,6 +82,21 @@ def test_an_executor_that_is_dropped_is_freed(ros_context, tmp_path, has_spun, i
     assert wait_for(lambda: (tmp_path / 'run.mcap').read_bytes().endswith(b'\x89MCAP0\r\n'))
 
 
+def test_objects_that_were_frozen_are_collected_once_the_run_has_ended(ros_context):
+    """Else nodes in reference cycles would remain, with what the middleware keeps for them."""
+    node = busy_node(ros_context)
+    node.itself = node
+    reference = weakref.ref(node)
+    with MultiDeadlineExecutor(context=ros_context, freeze_gc=True) as executor:
+        executor.add_node(node)
+        run(executor, node)
+        assert gc.get_freeze_count()
+        executor.remove_node(node)
+    del node
+    gc.collect()
+    assert reference() is None
+
+
 def test_a_dropped_executor_is_freed_after_a_callback_that_still_runs(ros_context):
     node, go_on, begun = busy_node(ros_context), threading.Event(), threading.Event()
     before = threading.active_count()
