@@ -63,7 +63,8 @@ PUBLICATIONS = _table(
 TAKES = _table(execution='i8', message='i8', time='i8')
 JOB_ENDS = _table(
     process='i2', dag='i4', vertex='i4', job='i8', time='i8', reason='i1', order='i8')
-DROPS = _table(process='i2', vertex='i4', job='i8', time='i8', reason='i2')
+DROPS = _table(
+    process='i2', callback='i8', vertex='i4', job='i8', time='i8', reason='i2')
 LOSSES = _table(process='i2', callback='i8', time='i8', count='i8')
 DEMOTIONS = _table(process='i2', dag='i4', vertex='i4', job='i8', time='i8')
 MISSES = _table(dag='i4', vertex='i4', job='i8', deadline='i8', completed='i8')

@@ -125,7 +125,8 @@ class _Part:
         self.seen_at = found.seen_at
         for addresses in (
                 tables['executions']['callback'], tables['losses']['callback'],
-                tables['unfinished']['callback'], tables['publications']['publisher']):
+                tables['unfinished']['callback'], tables['drops']['callback'],
+                tables['publications']['publisher']):
             addresses[(addresses > 0) & (addresses < 1 << _BITS)] |= self.place << _BITS
         worker = tables['executions']['worker']
         # other threads, with higher numbers, lent themselves

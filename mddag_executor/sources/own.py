@@ -407,10 +407,10 @@ class _Source:
         drops, reasons, hosted = [], dict[str, int](), []
         for place, event in self._others:
             if event[0] == _DROP:
-                _, now, _, _, _, dag, vertex, job, reason = event
+                _, now, _, _, callback, dag, vertex, job, reason = event
                 number = reasons.setdefault(reason, len(reasons))
-                drops.append((
-                    self._numbering.one(dag, vertex), signed(job), signed(now), number))
+                drops.append((signed(callback), self._numbering.one(dag, vertex), signed(job),
+                              signed(now), number))
             elif event[0] == _HOSTED:
                 vertices = self._hosted(event)
                 if vertices is not None:
@@ -418,8 +418,8 @@ class _Source:
             if event[0] in (_DROP, _HOSTED):
                 self._last_seen = max(self._last_seen, event[1])
         self._hosting = sorted(hosted, key=lambda h: h[:2])
-        vertex, job, time, reason = zip(*drops) if drops else ((), (), (), ())
-        return rows(DROPS, len(drops), vertex=vertex, job=job, time=time,
+        callbacks, vertex, job, time, reason = zip(*drops) if drops else ((),) * 5
+        return rows(DROPS, len(drops), callback=callbacks, vertex=vertex, job=job, time=time,
                     reason=reason), tuple(reasons)
 
     def _with_end(self, run: Run) -> Run:

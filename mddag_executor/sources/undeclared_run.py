@@ -299,13 +299,14 @@ class UndeclaredRun(ImportedRun):
             number = UNKNOWN if callback is None else callback.number
             if 'reason' in fields:
                 drops.append((
-                    process.get(pid, UNKNOWN), self._vertex.get(number, UNKNOWN), time,
+                    process.get(pid, UNKNOWN), number, self._vertex.get(number, UNKNOWN), time,
                     reasons.setdefault(str(fields['reason']), len(reasons))))
             elif isinstance(fields.get('count'), int):
                 losses.append((process.get(pid, UNKNOWN), number, time, fields['count']))
-        of, vertex, times, reason = zip(*drops) if drops else ((), (), (), ())
+        of, callbacks, vertex, times, reason = zip(*drops) if drops else ((),) * 5
         dropped = rows(
-            DROPS, len(drops), process=of, vertex=vertex, job=UNKNOWN, time=times, reason=reason)
+            DROPS, len(drops), process=of, callback=callbacks, vertex=vertex, job=UNKNOWN,
+            time=times, reason=reason)
         of, callbacks, times, count = zip(*losses) if losses else ((), (), (), ())
         lost = rows(LOSSES, len(losses), process=of, callback=callbacks, time=times, count=count)
         return replace(

@@ -172,6 +172,9 @@ class _Tables:
         #: By vertex the number of its process; the last one is that of undeclared callbacks.
         self._process = np.array([*processes_of(
             replace(schedule.task_set, processes=tuple(schedule.processes))), 1]) - 1
+        #: By vertex the number of its callback; the last one is that of undeclared callbacks.
+        self._callback = np.r_[
+            np.array(schedule.task_set.places_of_vertices(), dtype=np.int64) + 1, 0]
         self._log = _columns(schedule.log)
         self._decisions = _columns(schedule.decisions)
 
@@ -262,12 +265,10 @@ class _Tables:
             each.first, each.ends >= 0, order >= 0, each.dag < self._n_dags)
         total = np.cumsum(np.where(ran, each.end - each.start, 0))
         before = np.r_[0, total][first]
-        task_set = self._schedule.task_set
-        callback = np.r_[np.array(task_set.places_of_vertices(), dtype=np.int64) + 1, 0]
-        legs = np.where(Numbering(task_set).n_legs > 1, tables.ALL_LEGS, 0)
+        legs = np.where(Numbering(self._schedule.task_set).n_legs > 1, tables.ALL_LEGS, 0)
         return table_of(
             tables.EXECUTIONS, len(first), process=self._process[each.vertex],
-            callback=callback[each.vertex],
+            callback=self._callback[each.vertex],
             dag=np.where(declared, each.dag, -1), vertex=np.where(declared, each.vertex, -1),
             job=self._numbers(each.dag, each.job), leg=np.where(completes, legs[each.vertex], 0),
             piece=np.arange(len(first)) - first, thread=each.worker + 1, worker=each.worker,
@@ -319,7 +320,8 @@ class _Tables:
                 ended[dag[row], job[row]] = _DROPS.index(end[row])
         rows = np.array(found, dtype=np.int64)
         return table_of(
-            tables.DROPS, len(rows), process=self._process[vertex[rows]], vertex=vertex[rows],
+            tables.DROPS, len(rows), process=self._process[vertex[rows]],
+            callback=self._callback[vertex[rows]], vertex=vertex[rows],
             job=self._numbers(dag[rows], job[rows]), time=now[rows], reason=reasons)
 
     def demotions(self) -> Table:

@@ -76,11 +76,10 @@ def _events(run: ComputedRun, knows_cpu: bool) -> Iterator[_Entry]:
     for _, dag, sink, job, _, deadline, completed, until, _, order in missed.tolist():
         yield (until, min(order, NEVER), 1), 'deadline', until, 0, (
             dag, local[sink], job, deadline, completed)
-    address = [place + 1 for place in run.task_set.places_of_vertices()]
     dag_of = judged.tables.dag_of
-    for _, vertex, job, now, reason in recording.drops.tolist():
+    for _, callback, vertex, job, now, reason in recording.drops.tolist():
         yield (now, NEVER - 2, 0), 'drop', now, 0, (
-            address[vertex], dag_of[vertex], local[vertex], job,
+            callback, dag_of[vertex], local[vertex], job,
             recording.names.drop_reasons[reason])
     for _, dag, vertex, job, now in recording.demotions.tolist():
         yield (now, NEVER - 2, 0), 'demote', now, 0, (dag, local[vertex], job)

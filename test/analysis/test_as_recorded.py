@@ -348,7 +348,7 @@ def test_a_drop_may_have_numbers_of_other_widths(trace):
     key = trace.file.define(EventType('mddag', 'drop', tuple(fields)))
     trace.file.add(key, ns(1), 1, 1, *([2 ** 64 - 1] * 4), 'aborted')
     drops = open_recording(trace.end(110)).drops
-    assert drops[['vertex', 'job']].tolist() == [(-1, -1)]
+    assert drops[['callback', 'vertex', 'job']].tolist() == [(-1, -1, -1)]
 
 
 def test_a_trace_without_a_usable_declaration(tmp_path):

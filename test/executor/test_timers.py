@@ -229,6 +229,8 @@ def test_a_timer_that_is_reset_while_its_callback_waits_is_withdrawn(
     recording = open_recording(path)
     assert [recording.names.drop_reasons[each] for each in recording.drops['reason']] == [
         'withdrawn']
+    assert ['timer' in recording.callback_name(each) for each in recording.drops['callback']] == [
+        True]
 
 
 @pytest.mark.parametrize('sleeps', [False, True], ids=['timer', 'rate'])

@@ -122,6 +122,8 @@ def test_drops_are_of_the_jobs_of_the_run(tmp_path, key, reason, verdict):
     outcome = replay([up.end(90 * MS), down.end(90 * MS)])
     missed, = outcome.judged.missed
     assert (missed['job'], missed['kind']) == (4, verdict)
+    recording = outcome.recording
+    assert [recording.callback_name(each) for each in recording.drops['callback']] == ['/b:take']
     if reason == 'aborted':
         # it was ready, and nothing ran in its process
         assert outcome.explanation.worst()['parts'][-1]['cause'] == 'machine'
