@@ -21,6 +21,7 @@ import pytest
 
 from ..conftest import examples
 from ..sources.helpers import Chances, declarations, MS, PATHS, SMALL, VirtualRun
+from .graphs import TWO_RATES
 from .oracle import Oracle
 from .told import Told
 
@@ -260,20 +261,6 @@ def test_a_finished_recording_is_not_written(tmp_path):
                             (recording.columns, 'releases')):
             with pytest.raises(FrozenInstanceError):
                 setattr(each, field, None)
-
-
-TWO_RATES = """\
-mddag: 1
-nodes:
-  - {node: /lidar, callbacks: [{name: read, timer: 100ms, publishes: [/points]}]}
-  - {node: /boxes, callbacks: [{name: find, timer: 70ms, publishes: [/boxes], deadline: 1s}]}
-  - node: /fusion
-    callbacks:
-      - name: fuse
-        sync: {topics: [/points, /boxes], driven_by: /points}
-        publishes: [/fused]
-  - {node: /brake, callbacks: [{name: stop, subscription: /fused, deadline: 150ms}]}
-"""
 
 
 @pytest.mark.parametrize('has_stamps', [True, False])

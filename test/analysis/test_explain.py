@@ -11,6 +11,7 @@ import pytest
 
 from ..conftest import examples
 from ..sources.helpers import Chances, MS, ns, small, VirtualRun, Written
+from .graphs import TWO_RATES
 
 VICTIM = """\
 mddag: 1
@@ -526,24 +527,9 @@ def test_what_is_usual_in_the_whole_recording_is_usual_in_a_part(tmp_path):
     assert [each['cause'] for each in parts[0]] == ['released late', 'ran long', 'ran']
 
 
-SKIPS = """\
-mddag: 1
-workers: 1
-nodes:
-  - {node: /lidar, callbacks: [{name: read, timer: 100ms, publishes: [/points]}]}
-  - node: /fusion
-    callbacks:
-      - name: fuse
-        sync: {topics: [/points, /boxes], driven_by: /points}
-        publishes: [/fused]
-  - {node: /brake, callbacks: [{name: stop, subscription: /fused, deadline: 150ms}]}
-  - {node: /boxes, callbacks: [{name: find, timer: 100ms, publishes: [/boxes], deadline: 1s}]}
-"""
-
-
 def test_a_scan_that_the_program_skips_loses_no_message(tmp_path):
     """The answer to a later scan completes it; or it waits for boxes that never come."""
-    trace = Written(tmp_path / 'run.mcap', SKIPS)
+    trace = Written(tmp_path / 'run.mcap', TWO_RATES)
     for job, at in enumerate((0, 100, 1000)):
         trace.release(0, job, at)
         trace.run(0, 0, job, at, at + 2)
