@@ -279,7 +279,7 @@ def _executions(engine):
     if (bypass.is_open or bypass.queue or bypass.running) and not (
             bypass.is_open and engine._is_core_empty()):
         yield 'executions bypass the core, which has others'
-    known = {**engine._work, **{work.x: work for work in bypass.queue}}
+    known = {**engine._work, **bypass.queue}
     for entity in {work.entity for work in known.values()}:
         if any(x not in known or known[x].entity is not entity for x in entity.waiting):
             yield f'{[*entity.waiting]} are not all executions of one entity that wait'

@@ -310,14 +310,17 @@ class Engine:
         if entity.may_answer:
             self._end_bypass()
         else:
-            if waiting and 0 < entity.depth <= len(waiting) or (
-                    entity.outer >= 0 and not self.outer.is_open(entity.outer)):
+            if entity.outer >= 0 and not self.outer.is_open(entity.outer):
                 self._end_bypass()
             elif bypass.is_open or self._opens_bypass():
-                bypass.enter(work)
+                if waiting and 0 < entity.depth <= len(waiting):
+                    bypass.enter_full(work)
+                    self.verdicts.dropped(entity, NO_ORIGIN, 'qos_depth', now)
+                else:
+                    bypass.enter(work)
                 return
             self._undeclared += 1
-        self._enqueue(work)
+        self._enqueue(work, now)
         entity.ready += 1
         if 0 < entity.depth < len(waiting):
             self._drop_oldest(entity, now)
@@ -336,8 +339,8 @@ class Engine:
         """Return what the tasks of a running execution inherit; without the lock."""
         return self.heritage(work) if work.origin is None else None
 
-    def _enqueue(self, work: Work) -> None:
-        entity, since = work.entity, work.ready_ns
+    def _enqueue(self, work: Work, since: int) -> None:
+        entity = work.entity
         if entity.queue < 0:
             entity.queue = self.scheduler.new_queue()
         if entity.may_answer and entity.callback is not None and self._keys_are_times:
@@ -383,10 +386,10 @@ class Engine:
         if self._bypass.is_open:
             running, since, waiting = self._bypass.close()
             if running is not None:
-                self._enqueue(running)
+                self._enqueue(running, running.ready_ns)
                 self._start_next(running.worker, since)
             for work in waiting:
-                self._enqueue(work)
+                self._enqueue(work, min(work.place_ns, work.ready_ns))
         return self.scheduler
 
     @property

@@ -26,6 +26,7 @@ import threading
 import types
 from typing import Any, Protocol
 
+from mddag_executor.core import NEVER
 from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.compat import cancel_running
 from mddag_executor.executor.entity import Entity
@@ -128,6 +129,8 @@ class Work:
     :ivar starter: of a task: the execution on whose behalf it runs; None: none.
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
+    :ivar place_ns: when the dropped execution became ready of which it has the place, because the
+        queue was full (see ``bypass``); NEVER: it has its own place.
     :ivar due_ns: when its timer was due, on the trace's clock; 0: it is of no timer.
     :ivar n_resets: how many times its timer had been reset when it was due.
     :ivar was_reset: whether its timer was reset since it had been due before.
@@ -149,6 +152,7 @@ class Work:
     sent: tuple[tuple[str, int], ...] = ()
     x = worker = -1
     ready_ns = due_ns = cpu_ns = yields = paused_ns = suspended_ns = n_resets = 0
+    place_ns = NEVER
 
     def __init__(
         self, entity: Entity, function: Callable[..., Any], args: tuple[Any, ...] = (),

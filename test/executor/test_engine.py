@@ -5,7 +5,7 @@
 import threading
 from time import monotonic_ns
 
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from mddag_executor.core import NEVER, POLICIES
 from mddag_executor.core.jobs import source_depth
@@ -814,14 +814,41 @@ STEPS = st.lists(st.tuples(st.sampled_from([
     'lend', 'rejoin', 'go_on', 'fail', 'remove']), st.integers(0, 4)), min_size=1, max_size=80)
 
 
+# a full queue; it bypasses the core, or a declared timer ends the bypass
+NEXT = [('dispatch', 0), ('finish', 0)]
+FULL = [('ready', 2), ('ready', 3), ('ready', 2), *NEXT, ('ready', 2), ('ready', 2), ('ready', 3),
+        ('ready', 2)]
+
+
 @examples(300)
 @given(st.sampled_from(sorted(POLICIES)), STEPS)
+@example('rad', [*FULL, *3 * NEXT])
+@example('rad', [*FULL, ('ready', 4), *4 * NEXT])
+@example('fifo', [*FULL, ('ready', 4), *4 * NEXT])
 def test_what_bypasses_the_core_runs_as_the_core_would_run_it(policy, steps):
     twins = Steps(policy), Steps(policy)
     twins[1].engine.allow_bypass()
     for now, step in enumerate(steps):
         seen = [twin.seen(twin.do(*step, now), now) for twin in twins]
         assert seen[0] == seen[1], step
+
+
+def test_a_full_queue_drops_its_oldest_messages_without_the_core():
+    """Which would cost three times as much for each message until nothing waits."""
+    engine = new_engine(workers=2)
+    engine.allow_bypass()
+    full, other = new_entity(depth=2), new_entity()
+    full.wall_ns = other.wall_ns = 0
+    for now, entity in enumerate((full, other, full, full, other, full), 1):
+        engine.ready(Work(entity, print, (now,)), now)
+    started = []
+    while (work := engine.step(0, 7).work) is not None:
+        assert engine.scheduler.queue_length == 0
+        started.append(work.args[0])
+        engine.finished(work, 7, 7, 7, 0, 0)
+    # the oldest that is left has the place of the first one
+    assert started == [4, 2, 5, 6]
+    assert (full.ready, full.ran, full.dropped, engine.undeclared) == (4, 2, 2, 6)
 
 
 @examples(300)

@@ -327,11 +327,15 @@ awaiting.named(
         'test_the_stamp_of_a_result_says_which_of_several_messages_was_used')),
     # --- bypass.py
     Case('the_bypass_runs_the_last_one_first', [(
-        'executor/bypass.py', 'self.queue.popleft()', 'self.queue.pop()')], of(
+        'executor/bypass.py', 'x = next(iter(queue))', 'x = next(reversed(queue))')], of(
         'test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
     Case('the_core_does_not_hear_of_those_that_wait', [(
-        'executor/bypass.py', 'found = self.running, self._running_since, self.queue',
-        'found = self.running, self._running_since, deque()')], of(
+        'executor/bypass.py', 'self._running_since, self.queue.values()',
+        'self._running_since, ()')], of(
+        'test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
+    Case('a_full_queue_loses_its_place', [(
+        'executor/bypass.py', 'queue[first] = successor',
+        'del queue[first]; queue[first] = successor')], of(
         'test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
     # --- outer_places.py
     Case('callbacks_of_a_program_run_together', [(
