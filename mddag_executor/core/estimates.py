@@ -14,7 +14,7 @@ declared time counts again.
 from __future__ import annotations
 
 from mddag_executor.core.overload import admit, set_start
-from mddag_executor.core.state import FORGET_AT, State
+from mddag_executor.core.state import State
 from mddag_executor.core.tables import NEVER, Tables
 
 CHANGE = 8
@@ -47,6 +47,10 @@ class Estimates:
         # when to compare demand and capacity; NEVER: no time has changed
         self._admit_at = NEVER
         self._admitted_at = -NEVER
+        # when the first measured time is too old; NEVER: none was measured
+        self._forget_at = NEVER
+        # the earlier one of these
+        self._act_at = NEVER
 
     def note(self, vertex: int, mean: int, holds: int, now: int) -> None:
         """
@@ -60,28 +64,34 @@ class Estimates:
             mean = known
         else:
             s.measured_at[vertex] = now
-            if s.scalars[FORGET_AT] == NEVER:
-                s.scalars[FORGET_AT] = now  # the next measurement finds out
-        if now > s.scalars[FORGET_AT]:
-            self._forget(now)
+            if self._forget_at == NEVER:
+                self._forget_at = self._act_at = now  # finds out
         if abs(mean - known) * CHANGE > known + LEAST_CHANGE_NS or holds != s.holder[vertex]:
             s.mean[vertex] = mean
             s.holder[vertex] = holds
             self._update(vertex)
+        if now >= self._act_at:
+            self._act(now)
+
+    def _act(self, now: int) -> None:
+        """Forget old times, and compare demand and capacity, if it is time to."""
+        if now >= self._forget_at:
+            self._forget(now)
         if now >= self._admit_at:
             self._admit_at, self._admitted_at = NEVER, now
-            admit(self._t, s)
+            admit(self._t, self._s)
+        self._act_at = min(self._forget_at, self._admit_at)
 
     def _forget(self, now: int) -> None:
         """Forget the times that were measured too long ago."""
         t, s = self._t, self._s
-        s.scalars[FORGET_AT] = NEVER
+        self._forget_at = NEVER
         for vertex in range(t.n_vertices):
             if s.measured_at[vertex] < 0:
                 continue
             until = s.measured_at[vertex] + FORGET_PERIODS * t.period[t.dag_of[vertex]]
             if until >= now:
-                s.scalars[FORGET_AT] = min(s.scalars[FORGET_AT], until)
+                self._forget_at = min(self._forget_at, until + 1)
             else:
                 s.measured_at[vertex] = -1
                 s.mean[vertex] = t.mean_time[vertex]
@@ -103,6 +113,7 @@ class Estimates:
                 reach_by[i] = start - means[each]
             set_start(t, s, each)
         self._admit_at = self._admitted_at + ADMIT_NS
+        self._act_at = min(self._act_at, self._admit_at)
 
 
 def _steps_to(t: Tables, vertex: int) -> Steps:

@@ -47,7 +47,7 @@ def release_job(t: Tables, s: State, dag: int, job: int, release: int, now: int)
     :param job: index of the job in its DAG, from 0.
     :param release: time its source became due, ns; not later than ``now``.
     """
-    if t.expire_after[dag] < NEVER:
+    if s.oldest[dag] >= 0 and t.expire_after[dag] < NEVER:
         expire_idle(t, s, dag, now)
     if s.n_open[dag] >= t.max_active_jobs[dag]:
         give_up(t, s, s.oldest[dag], EXPIRED, now)

@@ -291,11 +291,10 @@ def may_start(s: State, entry: QueueEntry) -> bool:
 
 def first_waiting(s: State) -> int:
     """Return the first waiting execution; -1: there is none."""
-    if len(s.ready) == 0 and len(s.deferred) == 0:
-        return -1
-    if len(s.deferred) == 0 or (len(s.ready) > 0 and s.ready[0] < s.deferred[0]):
-        return first_of(s, s.ready[0])
-    return first_of(s, s.deferred[0])
+    heap = s.ready
+    if len(s.deferred) > 0 and (len(heap) == 0 or s.deferred[0] < heap[0]):
+        heap = s.deferred
+    return first_of(s, heap[0]) if len(heap) > 0 else -1
 
 
 def overtaking_pays(

@@ -35,9 +35,9 @@ ELSEWHERE, HERE, LEADS_OUT = range(3)
 # PARTS: there is more to find out (``rules._complete_part``).
 NOTHING, ENDS, PARTS = range(3)
 
-# Columns of ``scalars``.  ``FORGET_AT``: until when no measured execution time is too old.
-(ORDER, N_IDLE, PROPAGATE, JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY, FORGET_AT,
- N_SCALARS) = range(10)
+# Columns of ``scalars``.
+(ORDER, N_IDLE, PROPAGATE, JUDGE_FROM, JUDGE_UNTIL, SKIP, N_HOLDING, URGENCY,
+ N_SCALARS) = range(9)
 
 # Where the entry of a queue is (``queue_place``), if not in the heap of a callback group.
 READY, DEFERRED = -1, -2
@@ -216,7 +216,6 @@ def fill_state(
     s.scalars[PROPAGATE] = propagate
     s.scalars[URGENCY] = urgency
     s.scalars[JUDGE_FROM], s.scalars[JUDGE_UNTIL] = -NEVER, NEVER
-    s.scalars[FORGET_AT] = NEVER
     for v in range(t.n_vertices + 1):
         demotes = t.on_late[t.dag_of[v]] == DEMOTE and urgency != OTHER_KEYS
         s.start_by.append(t.latest_start[v] if demotes else NEVER)

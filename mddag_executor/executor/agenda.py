@@ -14,6 +14,9 @@ from typing import Any, Protocol
 
 from mddag_executor.core import NEVER
 
+CLEAN_EVERY = 16
+"""Each time that this many appointments (a power of two) were set, cancelled ones are removed."""
+
 
 class Appointment(Protocol):
     """
@@ -66,7 +69,12 @@ class Agenda:
             self.next = at
         if latest < self.latest:
             self.latest = latest
-        most = 2 * self._appointments + 8   # more after many changes
+        if not number & CLEAN_EVERY - 1:
+            self._clean()
+
+    def _clean(self) -> None:
+        """Remove cancelled entries if there are many."""
+        most = 2 * self._appointments + 8
         if len(self._heap) > most:
             self._heap = _without_cancelled(self._heap)
         if len(self._latest) > most:

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from itertools import count
 import secrets
 import threading
@@ -54,6 +55,9 @@ class Origin(NamedTuple):
     job: int
     vertex: int
 
+
+new_origin: Callable[[tuple[int, int, int, int]], Origin] = partial(tuple.__new__, Origin)
+"""Return an ``Origin`` with these fields: in two thirds of the time of a call of the class."""
 
 NO_ORIGIN = Origin(-1, -1, -1, -1)
 

@@ -43,11 +43,12 @@ again after this.
 
 QUIET_NS = 5_000_000
 """
-If no thread had nothing to run for this long, one that rests cancels the next look.
+If no thread had nothing to run for this long, one that rests lets the next look follow a timer.
 
-In a process with few callbacks this costs less than the look.  With many, the look is put off by
-up to ``NET_NS`` instead, so that the next callback need not set it, unless it would not come
-within ``NET_NS`` less this.
+It comes ``NET_NS`` after the next timer or other appointment, for which a thread wakes up anyway.
+So the callback of that timer need not set it.  In a process with many callbacks, the look is put
+off by up to ``NET_NS`` instead, so that the next callback need not set it, unless it would not
+come within ``NET_NS`` less this.
 """
 
 LOOK_PART = 4

@@ -220,12 +220,13 @@ class DueTimes:
         first = self._agenda.next
         if first != self._timer.at:
             self._timer.arm(first)
-        # a parked thread would look, although one waits
+        # A parked thread would look, although one waits.  The next callback need not set the look.
+        watch = self._watch
         if now - self._rested_at > QUIET_NS:
-            if self._watch.at < NEVER:
-                self._watch.arm(NEVER)
-        elif self._watch.at < now + NET_NS - QUIET_NS:
-            self._watch.arm(now + NET_NS)  # the next callback need not set it
+            if watch.at < first + QUIET_NS and watch.at < NEVER:
+                watch.arm(first + NET_NS if first < NEVER else NEVER)
+        elif watch.at < now + NET_NS - QUIET_NS:
+            watch.arm(now + NET_NS)
         self._rested_at = now
 
     def arm_by(self, at: int) -> None:

@@ -60,6 +60,7 @@ from mddag_executor.executor.answers import Answers, open_release
 from mddag_executor.executor.attribution import (
     Announced,
     Attribution,
+    new_origin,
     NO_ORIGIN,
     Origin,
     PublisherState,
@@ -406,7 +407,7 @@ class Engine:
     def _start_job(self, work: Work, release: int, now: int) -> None:
         dag = self.tables.dag_of[work.entity.source]
         slot, state, source = self.release_job(dag, release, now), self._state, work.entity.source
-        work.origin = Origin(slot, dag, state.job_index[slot], source)
+        work.origin = new_origin((slot, dag, state.job_index[slot], source))
         self._start(work, state.job_base[slot] + self.tables.region_offset[source], now)
 
     def _enter(self, job: Announced, release: int, now: int) -> Origin | None:
@@ -453,7 +454,7 @@ class Engine:
         x = state.job_base[slot] + self.tables.region_offset[vertex] + leg
         if state.x_state[x] != IDLE:
             return False  # a second message for the same vertex of the same job
-        work.origin = Origin(slot, dag, job, vertex)
+        work.origin = new_origin((slot, dag, job, vertex))
         self._start(work, x, now)
         if 0 < entity.depth < len(entity.waiting):
             self._drop_oldest(entity, now)
@@ -748,8 +749,7 @@ class Engine:
                 holders.pop()
             else:
                 self._let_go(work)
-        if self._is_plain and not failed and entity.awaiting is None and (
-                not self.verdicts.tally.overdue):
+        if self._is_plain and not failed and entity.awaiting is None:
             x, work.x = work.x, -1
             origin = work.origin
             if self._complete(x, end) and origin is not None:

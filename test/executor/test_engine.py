@@ -721,6 +721,12 @@ def test_how_long_a_timer_may_stay_unnoticed(make_executor, kind, deadline, part
     assert pool_of(executor).due.allowance(entity, 10 * MS) == part * MS
 
 
+class Appointment:
+    """Something that is done at a time."""
+
+    entry = None
+
+
 def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
     """No parked thread is to wake up in vain while it waits; after a quiet time, none at all."""
     pool = pool_of(make_executor())
@@ -732,8 +738,13 @@ def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
             watch.arm(begin + look * MS)
             due.arm_idle(begin + ms * MS)
             found.append(watch.at if watch.at == NEVER else (watch.at - begin) // MS)
+        pool.agenda.set(Appointment(), begin + 150 * MS, begin + 150 * MS)
+        for ms, look in ((120, 125), (130, 170), (130, 140)):
+            watch.arm(begin + look * MS)
+            due.arm_idle(begin + ms * MS)
+            found.append((watch.at - begin) // MS)
         pool.running, pool.polling = False, 0
-    assert found == [NEVER, 121, 120, NEVER]
+    assert found == [NEVER, 121, 120, NEVER, 170, 170, 150]
 
 
 class Steps:
