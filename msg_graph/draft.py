@@ -14,9 +14,7 @@ which is an entry once its first ``# `` is removed. While blanks are open, they 
 the declaration (``open_blanks``), since most others follow from them:
 
 1. *deadline* of a sink: the shortest period of the sources that lead to it; none, if it only
-   stores a message, and is not the only result of its DAG.  For a source without a fixed rate it
-   is the mean time between two executions: the least one, which is its period, is arbitrarily
-   short if messages or requests come from several publishers or clients.
+   stores a message, and is not the only result of its DAG.
 2. *period* of a service, and of a subscription whose topic no callback publishes: the measured
    time between two of its executions, if there is one.
 3. *publishes*, if it is unknown which of a node's callbacks publishes a topic: on each that may.
@@ -65,7 +63,7 @@ class DraftCallback:
     :ivar possible_topics: topics of its node that it may publish.
     :ivar reads: topics and callbacks of its node that it reads by queue edges.
     :ivar runs: how many executions of it were recorded; None: there is no recording.
-    :ivar interval_ns: measured mean time between two of its executions.
+    :ivar interval_ns: measured usual time between two of its executions.
     :ivar times: its measured execution time, and the number of measured executions.
     :ivar other_keys: other declared keys, with their values.
     :ivar sometimes: topics of ``publishes`` that it publishes only sometimes: in how many of how
@@ -73,8 +71,8 @@ class DraftCallback:
     :ivar judged: of a sink: False if it has no deadline.
     :ivar driven_by: of a sync of different rates, the topic of ``started_by`` that drives it.
     :ivar why: of a proposed sync, a comment with the reason.
-    :ivar least_interval_ns: if the times between its executions are irregular, or it is a service,
-        the least of them.
+    :ivar is_irregular: whether the times between its executions are irregular, or it is a service:
+        ``interval_ns`` is the least mean of several.
     :ivar came_once: whether it ran only once in a long recording, as for a latched topic.
     :ivar stores: whether it seems to only store its message: it is short and publishes nothing.
     """
@@ -99,7 +97,7 @@ class DraftCallback:
     judged: bool = True
     driven_by: str | None = None
     why: str = ''
-    least_interval_ns: int | None = None
+    is_irregular: bool = False
     came_once: bool = False
     stores: bool = False
 
@@ -120,14 +118,7 @@ class DraftCallback:
         """Return the time between two releases if this is a source, if known."""
         if self.came_once and self.period_ns is None:
             return SECOND
-        return self.period_ns or self.least_interval_ns or self.interval_ns
-
-    @property
-    def usual_interval_ns(self) -> int | None:
-        """Return the usual time between two releases if this is a source, if known."""
-        if self.period_ns is None and self.least_interval_ns is not None:
-            return max(self.least_interval_ns, self.interval_ns or 0)
-        return self.source_period_ns
+        return self.period_ns or self.interval_ns
 
 
 @dataclass
@@ -285,10 +276,10 @@ class _Writer:
         return _is_source(callback, self._perhaps_published)
 
     def _fastest_sources(self) -> dict[str, DraftCallback]:
-        """Return by callback the source with the shortest usual interval that may lead to it."""
+        """Return by callback the source with the shortest period that may lead to it."""
         found: dict[str, DraftCallback] = {}
-        sources = [c for c in self._callbacks if self._is_source(c) and c.usual_interval_ns]
-        for source in sorted(sources, key=lambda c: c.usual_interval_ns or 0):
+        sources = [c for c in self._callbacks if self._is_source(c) and c.source_period_ns]
+        for source in sorted(sources, key=lambda c: c.source_period_ns or 0):
             stack = [source]
             while stack:
                 callback = stack.pop()
@@ -424,11 +415,11 @@ class _Writer:
             yield f'period: {exact_duration(callback.period_ns)}'
             if callback.release_from != 'arrival':
                 yield f'release_from: {callback.release_from}'
-        elif callback.least_interval_ns is not None:
+        elif callback.is_irregular:
             yield self._proposal(
-                f'period: {_rounded(callback.least_interval_ns)}', what,
-                'the least measured time between two of its executions'
-                + ('' if is_service else ', which are irregular'))
+                f'period: {_rounded(callback.interval_ns or 0)}', what,
+                'the least measured time between two of its executions, as a mean of several'
+                + ('' if is_service else ': they are irregular'))
             yield self._proposal(
                 'sporadic: true', 'whether it has no fixed rate',
                 'requests come when they are needed' if is_service else 'its rate is irregular')
@@ -460,13 +451,11 @@ class _Writer:
         source = self._fastest.get(callback.key)
         if source is None:
             return _blank('deadline: 100ms', f'{what}; no source with a known period leads here')
-        usual = (_rounded(source.usual_interval_ns or 0) if source.period_ns is None
+        usual = (_rounded(source.source_period_ns or 0) if source.period_ns is None
                  else _whole(source.period_ns))
         kind = 'timer' if source.kind == 'timer' else 'source'
-        is_mean = source.period_ns is None and source.least_interval_ns is not None
-        return self._proposal(f'deadline: {usual}', what, (
-            'the mean measured time between two executions' if is_mean else 'the period')
-            + f' of the {kind} that leads here')
+        return self._proposal(
+            f'deadline: {usual}', what, f'the period of the {kind} that leads here')
 
     def _paths(self) -> Iterator[str]:
         found = [(path, self._path_keys(path)) for path in self._draft.paths]

@@ -26,7 +26,16 @@ Theory of operation
    than a period after it was made.
 7. Subscriptions of a node are one sync (``_find_syncs``) if the messages that they publish have
    the header stamps of several of their topics, or are as many as the messages of one of them.
-8. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
+8. The period of a subscription or service comes from the times at which its messages or requests
+   arrived (``usual_interval``), not from when it ran: executions of a busy pool come in bursts.
+   If the gaps are alike, the period is their median.  Otherwise it is that of the means of
+   ``IN_A_ROW`` successive gaps, if these are alike: messages of two publishers, or of a network
+   that delivers two at a time.  Otherwise it is the least of these means: a single gap may be
+   arbitrarily short, and a simulation releases a job in each period.  If there are fewer gaps,
+   that many would have taken longer than the recording.
+   A source is ``sporadic`` if nothing is alike, if pauses take a good part of the time, or if it
+   is a service.
+9. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
    that completed it: the others only store a message.
 """
 
@@ -51,6 +60,7 @@ from msg_graph import Callback as Declared
 from msg_graph import EMPTY_TASK_SET, ExecutionTime, TaskSet
 from msg_graph.binding import function_of, is_background, is_side_output, OF_RATE
 from msg_graph.draft import Draft, DraftCallback, DraftNode, DraftPath, leave_out_sources
+from msg_graph.drift import TOLERANCE
 from msg_graph.duration import DAY, exact_duration
 from msg_graph.language import CALLBACK, NODE, SERVICE, TOPIC
 import numpy as np
@@ -65,7 +75,11 @@ COPIED_SHARE = 0.9
 STORES_NS = 500_000
 """A callback that only stores its message takes no longer in nine of ten executions."""
 IRREGULAR = 3
-"""Times between executions are irregular if the 90 % quantile is this many times the 10 % one."""
+"""Gaps between arrivals are alike if the 90 % quantile is at most this many times the 10 % one."""
+IN_A_ROW = 10
+"""The mean of this many gaps is steady, even if messages come two or three at a time."""
+_STEADY = 1.5
+"""… and the means are alike up to this ratio.  That of purely random arrivals is about 2.3."""
 _LONG_NS = 2_000_000_000
 """One message in at least this time has no rate."""
 ONCE_PERIODS = 3
@@ -83,7 +97,8 @@ class Runs(NamedTuple):
     """
     The executions of a callback.
 
-    :ivar starts: of each, ns; ``times``: how long each took, all pieces together.
+    :ivar starts: of each, ns; ``arrivals``: when each became ready.
+    :ivar times: how long each took, all pieces together.
     :ivar due: of a timer, when each was due, as far as it is known, ns.
     :ivar whole: which of them completed a vertex.
     :ivar topics: what they published on, in the order of time.
@@ -91,6 +106,7 @@ class Runs(NamedTuple):
     """
 
     starts: Ints
+    arrivals: Ints
     due: Ints
     times: Ints
     whole: Mask
@@ -194,7 +210,8 @@ class System:
             self._made_again.add(before.number)
             if runs is not None and again is not None:
                 again = Runs(
-                    np.append(runs.starts, again.starts), np.append(runs.due, again.due),
+                    np.append(runs.starts, again.starts),
+                    np.append(runs.arrivals, again.arrivals), np.append(runs.due, again.due),
                     np.append(runs.times, again.times), np.append(runs.whole, again.whole),
                     runs.topics + again.topics, {
                         topic: runs.published.get(topic, 0) + again.published.get(topic, 0)
@@ -461,14 +478,11 @@ class System:
             callback.times = execution_time(np.concatenate(
                 [leg.times[leg.whole] for leg in legs or [runs]]))
         else:
-            callback.interval_ns = int(np.ptp(runs.starts)) // (count - 1) if count > 1 else None
-            between = np.sort(np.diff(np.sort(runs.starts)))
-            # a client sends a request when it needs one
-            if count > 1 and callback.kind == 'service' or (
-                    count > IRREGULAR and callback.kind != 'timer'
-                    and between[len(between) * 9 // 10] > IRREGULAR * between[len(between) // 10]):
-                callback.least_interval_ns = max(1_000, int(between[0]))
-            elif count == 1 and callback.kind != 'timer' and self._length > _LONG_NS:
+            if count > 1:
+                # a client sends a request when it needs one
+                callback.interval_ns, callback.is_irregular = usual_interval(
+                    runs.arrivals, self._end, False if callback.kind == 'service' else None)
+            elif callback.kind != 'timer' and self._length > _LONG_NS:
                 callback.came_once = True
             callback.times = execution_time(runs.times)
         return True
@@ -567,8 +581,38 @@ def _runs_of(recording: Recording, which: Ints) -> Runs:
     first = np.flatnonzero(table['piece'] == 0)
     last = np.append(first, len(table))[1:] - 1
     due = table['due'][first]
-    return Runs(table['start'][first], due[due > 0], table['busy'][last],
+    return Runs(table['start'][first], table['ready'][first], due[due > 0], table['busy'][last],
                 table['completes'][last] == VERTEX, [], {})
+
+
+def usual_interval(arrivals: Ints, end: int, steady: bool | None = None) -> tuple[int, bool]:
+    """
+    Return the period of at least two arrivals, ns, and whether it is only the least one (rule 8).
+
+    :param end: of the recording, ns.
+    :param steady: whether the rate is known to be steady or not; None: it is found out.
+    """
+    arrivals = np.sort(arrivals)
+    gaps = np.diff(arrivals)
+    means = (arrivals[IN_A_ROW:] - arrivals[:-IN_A_ROW]) // IN_A_ROW
+    alike = gaps if _ratio(gaps) <= IRREGULAR else means if (
+        len(means) > 2 * IN_A_ROW and _ratio(means) <= _STEADY) else None
+    usual = None if alike is None else int(np.median(alike))
+    # a node may end before the recording; after a few messages its silence says more
+    first, last = int(arrivals[0]), int(arrivals[-1]) if len(means) else end
+    if steady is None:
+        steady = usual is not None and last - first <= (1 + TOLERANCE) * usual * len(arrivals)
+    if usual is None or not (steady or len(means)):
+        usual = int(means.min() if len(means) else max(
+            int(arrivals[-1] - first) // len(gaps), (end - first) // IN_A_ROW))
+    return max(1_000, usual), not steady
+
+
+def _ratio(times: Ints) -> float:
+    """Return the 90 % quantile of times, divided by the 10 % quantile."""
+    times = np.sort(times)
+    low, high = times[len(times) // 10], times[len(times) * 9 // 10]
+    return float(high) / max(1, int(low))
 
 
 def _was_reset(timer: Callback, due: Ints) -> bool:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Systems from traces: who is who, what was measured, what drifted; on traces made here."""
 
+import random
 import re
 
 from mddag_executor import Replay, replay
@@ -205,7 +206,7 @@ def test_a_timer_that_fired_once_may_be_reset(tmp_path):
 
 
 def test_two_clients_of_a_service_do_not_give_it_a_tiny_deadline(tmp_path):
-    """Requests of both come together: the least time between two says nothing of deadlines."""
+    """Requests of both come together: the least time between two says nothing of their rate."""
     r = Recorded(tmp_path / 'n.mcap')
     r.node(300, '/planner')
     r.timer(1, 300, 50 * MS)
@@ -221,12 +222,51 @@ def test_two_clients_of_a_service_do_not_give_it_a_tiny_deadline(tmp_path):
             ran(r, 430, 3, at + after + 2_000, 1_000_000)
     draft = System(r.write()).draft()
     text = declaration_of(draft)
-    assert 'period: 10us' in text and 'deadline: 10us' not in text
+    assert '10us' not in text
     accept(draft)
     drive, plan = (each for each in loads(declaration_of(draft, accepted=True)).callbacks
                    if each.kind != 'timer')
-    assert plan.period_ns == 10_000 and plan.sporadic
-    assert 49 * MS < drive.deadline_ns < 52 * MS
+    assert plan.period_ns == drive.deadline_ns == 50 * MS and plan.sporadic
+
+
+def jitter(count, period, most, seed=1):
+    """Return arrivals each period, ms, which are late by at most a time, but for lost ones."""
+    chance = random.Random(seed)
+    return [period * k + chance.uniform(0, most) for k in range(count) if chance.random() < 0.95]
+
+
+@pytest.mark.parametrize(('arrivals', 'low', 'high', 'sporadic'), [
+    (jitter(300, 100, 5), 99, 101, False),
+    (jitter(300, 100, 90), 95, 110, False),
+    ([at + late for at in jitter(300, 67, 1) for late in (0, 0.3)], 33, 36, False),
+    ([*jitter(150, 100, 5), *(30_000 + at for at in jitter(150, 100, 5))], 99, 101, True),
+    ([15_000 * k + 100 * i for k in range(4) for i in range(50)], 100, 100, True),
+    ([at + late for at in (0, 900, 4_000, 4_700, 7_000, 9_000, 9_500) for late in (0, 5)],
+     800, 950, True),
+    ([0, 1, 2], 5_900, 6_000, True),
+    ([0, 100, 200], 100, 100, False)],
+    ids=['sensor', 'network', 'frames two at a time', 'pause', 'phases', 'button that bounces',
+         'burst', 'three'])
+def test_the_period_of_a_topic_from_outside(tmp_path, arrivals, low, high, sporadic):
+    """It is the usual one, and not the least time between two messages, which may be tiny."""
+    r = Recorded(tmp_path / 'n.mcap')
+    r.node(100, '/use')
+    r.node(200, '/driver')
+    r.publisher(120, 200, '/in')
+    r.timer(9, 200, 10 * MS)    # its node publishes in a thread of its own
+    r.subscription(130, 100, '/in')
+    for at in arrivals:
+        ran(r, 130, 1, 1_000 * MS + round(at * MS), 1_000)
+    ran(r, 9, 2, 1_010 * MS, 1_000)
+    # the publisher may go on for a period; three messages in a minute have no rate
+    last = 60_000 if arrivals == [0, 1, 2] else arrivals[-1] + 50
+    ran(r, 9, 2, 1_000 * MS + round(last * MS), 1_000)
+    draft = System(r.write()).draft()
+    accept(draft)
+    use, = (each for each in loads(declaration_of(draft, accepted=True)).callbacks
+            if each.kind == 'subscription')
+    assert low * MS <= use.period_ns <= high * MS
+    assert use.deadline_ns == use.period_ns and use.sporadic is sporadic
 
 
 def lifecycle(path, second_period, symbol='robot.Driver.tick'):
