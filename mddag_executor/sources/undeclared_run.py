@@ -14,7 +14,8 @@ the causes of executions.  Differences:
 2. *Publications to messages.*  A publication is recorded just before sending; its source timestamp
    is not recorded.  A timestamp belongs to a publication of its topic that was being sent then: it
    had begun, and its thread had neither published again nor ended its callback.  If several
-   publications fit, the number of the message decides (``stamps``).
+   publications fit, the number of the message decides (``stamps``).  If the system clock was set
+   during the run, the timestamps are moved back to the clock of the trace (``_without_steps``).
 3. *Ready* is recorded, and so is the due time of a timer, which is its release.  Version 2 did
    not record the due time.  In its traces a timer's release is the last time on its period's grid,
    whose origin is found as follows.  When a timer was noticed, the periods that had passed were
@@ -45,7 +46,7 @@ from mddag_executor.recording.joins import as_of, distinct, rows_by, sort_by
 from mddag_executor.recording.losses import Loss
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, UNKNOWN
-from mddag_executor.sources.entities import INIT_EVENTS, signed
+from mddag_executor.sources.entities import Entities, INIT_EVENTS, signed
 from mddag_executor.sources.executions import number_pieces
 from mddag_executor.sources.head import no_end, steps
 from mddag_executor.sources.imported_events import (
@@ -73,6 +74,8 @@ _DROP, _MESSAGES_LOST, _UNFINISHED, CLOCK_STEP = (
 _SOON_NS, _SOON_PART = 1_000_000, 10
 # One in this many releases may exclude the origin of the grid, and one has to exclude others.
 _ONE_OF = 20
+# A step of the system clock is noticed within this time.
+_NOTICED_NS = 100_000_000
 # Due times are on the grid if they differ from it by at most this part of the period.
 _A_LITTLE = 100
 
@@ -83,6 +86,13 @@ class OwnLinks(Links):
 
     :ivar own_runs: by execution whether this executor ran it.
     """
+
+    def __init__(self, events: Events, who: Entities) -> None:
+        #: The steps of the system clock: time and process, and by how much forward, ns.
+        self._steps = sorted(
+            (event[1], event[2], event[4]) for event in events.others
+            if event[0].name == CLOCK_STEP and isinstance(event[4], int))
+        super().__init__(events, who)
 
     def _stamp_messages(self) -> Ints:
         """Find the source timestamps of publications (rule 2)."""
@@ -109,6 +119,7 @@ class OwnLinks(Links):
         first = np.sort(order[new])
         takes, topics = takes[first], topics[first]
         numbers = np.where(kind[takes] == TAKE, table['d'][takes], 0)
+        sent_at = self._without_steps(takes)
         is_own = self.is_own[table['thread'][found['at']]]
         several: list[tuple[int, int]] = []
         for topic, (mine, asked) in enumerate(zip(*(
@@ -118,13 +129,39 @@ class OwnLinks(Links):
                 mine = mine[is_own[mine]]
                 mine = mine[sort_by(begins[mine])]
                 asked = asked[~np.isin(table['b'][takes[asked]], known)]
-            at = takes[asked]
-            found['stamp'][mine], doubtful = find_stamps(
+            stamps, doubtful = find_stamps(
                 Sent(begins[mine], ends[mine], found['publisher'][mine]),
-                table['b'][at], numbers[asked])
+                sent_at[asked], numbers[asked])
+            if self._steps:
+                stated = dict(zip(sent_at[asked].tolist(), table['b'][takes[asked]].tolist()))
+                stamps = np.array([stated.get(each, 0) for each in stamps.tolist()])
+                doubtful = [stated[each] for each in doubtful]
+            found['stamp'][mine] = stamps
             several += [(topic, stamp) for stamp in doubtful]
         return np.concatenate([
             others, np.array(several, dtype=np.int64).reshape(-1, 2)])
+
+    def _without_steps(self, takes: Ints) -> Ints:
+        """
+        Return the source timestamps of taken messages by the clock of the trace (rule 2).
+
+        A message was sent after a step of the clock if its timestamp without the step is not
+        earlier than the step, nor later than when it was taken.  This holds on one machine only:
+        the messages of another one have its clock.
+        """
+        table = self.events
+        stamps, taken_at = table['b'][takes], table['time'][takes]
+        pid = self._pid[table['thread'][takes]]
+        shift = dict(zip(self._pid.tolist(), self.shift.tolist()))
+        moved_by: dict[int, int] = {}
+        found = stamps
+        for time, of, step in self._steps if len({*shift.values()}) < 2 else ():
+            moved_by[of] = moved_by.get(of, 0) + step
+            sent = stamps - moved_by[of]
+            moved = shift.get(of, 0)
+            after = (pid == of) & (sent >= time - moved - _NOTICED_NS) & (sent <= taken_at - moved)
+            found = np.where(after, sent, found)
+        return found
 
     def _stamped_takes(self) -> tuple[Ints, Ints]:
         """Return the events that say which messages were taken, and the topics of each."""

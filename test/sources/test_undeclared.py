@@ -103,6 +103,24 @@ def undeclared(source, target):
     return text
 
 
+@pytest.mark.parametrize('steps', [{3: 5_000}, {3: -250}, {3: 5_000, 6: -7_000}, {3: -0.5}],
+                         ids=['forward', 'back', 'both', 'little'])
+def test_messages_are_joined_though_the_system_clock_was_set(run, steps):
+    """Source timestamps are by that clock; the trace has its own."""
+    ahead = 0
+    for job in range(10):
+        at = 100 * job
+        if job in steps:
+            ahead += steps[job]
+            run.add('clock_step', at - 2, round(steps[job] * MS))
+        run.runs(GRAB, at, at + 2, at + 1, due=at)
+        run.takes(at + 1.009 + ahead, at + 1.099)
+        run.runs(RUN, at + 1.101, at + 6, ready=at + 1.1)
+    result = run.result(1000)
+    assert of_camera(result)['completed'] == 10
+    assert of_camera(result)['response_ns']['max'] == 6 * MS
+
+
 def test_with_an_idle_worker_a_callback_waits_for_the_interpreter(run):
     # the trace does not say whether the other one held it, so it may have
     for job in range(3):
