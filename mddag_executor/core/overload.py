@@ -31,13 +31,15 @@ from mddag_executor.core.state import (
 )
 from mddag_executor.core.tables import IMPORTANT, NEVER, Tables
 
-LATE_DEADLINES = 8
+LATE_DEADLINES = 6
 """
 A late queue is ordered as if it were released this many relative deadlines later.
 
-It is found late at the latest one deadline after its release, and runs at the latest one deadline
-after its new release.  So each callback starts about once in ten of its relative deadlines,
-however long the overload lasts.  Less important work gives way to a late sink for as many.
+It is found late at the latest one deadline after its release, and its turn is at the latest one
+deadline after its new release: eight in all.  Up to one deadline may pass before that until the
+next release, and one is left for what runs already or has its turn as well.  So each callback
+starts once in ten of its relative deadlines, however long the overload lasts.  Less important work
+gives way to a late sink for this many.
 """
 PPM = 1_000_000
 

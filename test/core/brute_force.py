@@ -268,7 +268,7 @@ class BruteForce:
 
     def _later(self, job):
         deadline = max(job.dag.vertices[s].deadline_ns or 0 for s in job.dag.sinks)
-        return self.now * self.tick + 8 * deadline
+        return self.now * self.tick + 6 * deadline
 
     def _released_at(self, execution, release):
         """Return the priority of an execution if its job had been released at a time, ns."""

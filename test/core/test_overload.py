@@ -136,7 +136,7 @@ def test_demoted_callbacks_do_not_starve():
     sinks = results(case_of(
         timer('sensor', 10, 2, 1), timer('a', 40, 80, 20), timer('b', 40, 80, 20)), 4000)
     assert sinks['sensor']['in_time'] < 200 and sinks['sensor']['demoted'] > 0
-    assert sinks['sensor']['completed'] >= 4000 // (11 * 2 + 20)  # one in 11 deadlines
+    assert sinks['sensor']['completed'] >= 4000 // (9 * 2 + 20)  # one in nine deadlines
 
 
 # --- importance ----------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def test_less_important_work_gives_way_to_a_late_important_sink():
         timer('first', 40, 10, 10, importance='low'),
         timer('second', 40, 20, 15, importance=importance)), 8000)['second']['in_time']
         for importance in ('low', 'high'))
-    assert low == 0 and high >= 0.8 * 200
+    assert low == 0 and high >= 0.7 * 200  # the first has a turn in each eight of its deadlines
 
 
 def test_an_important_sink_shares_its_importance_with_what_it_reads():
@@ -205,10 +205,10 @@ def simulated_runs(late, **keys):
 @pytest.mark.parametrize('keep', ['all', 'newest'])
 @pytest.mark.parametrize('importance', ['low', 'normal'])
 @pytest.mark.parametrize('late', [0, 1])
-def test_each_callback_runs_once_in_about_ten_deadlines(keep, importance, late):
+def test_each_callback_runs_once_in_about_eight_deadlines(keep, importance, late):
     """Also if each message is replaced before it is late: its age stays with the queue."""
     starts = [0, *simulated_runs(late, keep=keep, importance=importance), 20_000]
-    assert max(after - before for before, after in zip(starts, starts[1:])) <= 10 * 100 + 30
+    assert max(after - before for before, after in zip(starts, starts[1:])) <= 8 * 100 + 30
 
 
 @examples(150)
@@ -216,7 +216,7 @@ def test_each_callback_runs_once_in_about_ten_deadlines(keep, importance, late):
              importance=True, newest=True), st.integers(1, 5))
 def test_no_callback_starves(case, heavier):
     """
-    Each timer starts within ten of its relative deadlines, in an overload of any size.
+    Each timer starts within eight of its relative deadlines, in an overload of any size.
 
     While it waits, executions of others may have to run that have begun, or are as late: twice one
     of each callback at the most.
@@ -233,7 +233,7 @@ def test_no_callback_starves(case, heavier):
             starts[dag].append(time)
     for dag, times in enumerate(starts):
         releases = [time // TICK for time, other in zip(load.times, load.dags) if other == dag]
-        most = 10 * deadlines[dag] + 2 * sum(map(sum, case.ticks))
+        most = 8 * deadlines[dag] + 2 * sum(map(sum, case.ticks))
         for last, start in zip(times, [*times[1:], horizon]):
             waits_since = min((time for time in releases if time > last), default=start)
             assert start - waits_since <= most, (dag, last, waits_since, start)
@@ -285,7 +285,7 @@ def test_no_dag_of_several_callbacks_starves(capacity):
     assert len(starts) == len(task_set.vertices)
     for (dag, _), times in starts.items():
         longest = max(after - before for before, after in zip(times, [*times[1:], horizon]))
-        assert longest <= 12 * max(
+        assert longest <= 10 * max(
             task_set.dags[dag].vertices[sink].deadline_ns for sink in task_set.dags[dag].sinks
         ) / TICK + 4 * each_once, (dag, times[-3:])
 
@@ -314,7 +314,7 @@ def overloaded(seed):
 
 
 @pytest.mark.parametrize('seed', [12, 30, 50, 58, 81, 94, 110, 113])
-def test_each_callback_of_a_chain_runs_once_in_ten_deadlines(seed):
+def test_each_callback_of_a_chain_has_its_turn(seed):
     """Also if its callback group is busy, or a preempted callback owns the group."""
     case, horizon = overloaded(seed), 12_000
     starts = {}
@@ -325,7 +325,7 @@ def test_each_callback_of_a_chain_runs_once_in_ten_deadlines(seed):
     each_once = sum(map(sum, case.ticks))
     for dag in case.task_set.dags:
         deadlines = [dag.vertices[sink].deadline_ns for sink in dag.sinks]
-        most = (dag.period_ns + 10 * max(deadlines, default=NEVER)) / TICK + 2 * each_once
+        most = (dag.period_ns + 8 * max(deadlines, default=NEVER)) / TICK + 2 * each_once
         for vertex in dag.vertices:
             times = starts.get((dag.index, vertex.index), [0])
             assert max(after - before for before, after in zip(times, [*times[1:], horizon])) <= (
