@@ -15,8 +15,10 @@ Theory of operation
 * The execution time of a vertex is the sum of the pieces of its execution.  If it did not complete
   (dropped, expired, open at the end), it is the callback's median, otherwise the declared mean,
   and at least as long as it has run.  A failed execution has the time until it failed.
-* A callback without any known time never ran in the recording, so it does not run here either: its
-  messages never arrive, and jobs that begin with it are skipped.
+* A callback without any known time whose messages arrived ran elsewhere, in a process that is not
+  recorded.  It takes no time, and its messages arrive as long after the one before as they did.
+* Another callback without any known time never ran, so it does not run here either: its messages
+  never arrive, and jobs that begin with it are skipped.
 * A job that expired at its release never ran: its timer was noticed after its next period.  This
   depends on the machine, not on the scheduler, so the job is skipped again.
 * A sync vertex has the execution time of the leg that completed it.  Earlier legs, which only
@@ -73,8 +75,8 @@ class RecordedLoad(NamedTuple):
 
     ``jobs`` has, by DAG, the recorded index of each job; ``demand`` the execution times of all
     declared jobs, ns; ``estimated`` counts vertices of jobs without a recorded execution time,
-    ``executions`` counts all; ``silent`` names callbacks that never ran. ``dispatches``
-    is the dispatch part of ``load.costs``; it is empty without overheads. ``dispatch_ns`` and
+    ``executions`` counts all; ``silent`` names callbacks that never ran, ``elsewhere`` those that
+    ran where nothing was recorded. ``dispatches`` is the dispatch part of ``load.costs``; it is empty without overheads. ``dispatch_ns`` and
     ``transport_ns`` are measured medians, None if nothing was measured.
     """
 
@@ -84,6 +86,7 @@ class RecordedLoad(NamedTuple):
     executions: int
     estimated: int
     silent: list[str]
+    elsewhere: list[str]
     dispatch_ns: int | None = None
     transport_ns: int | None = None
     dispatches: Any = ()
@@ -168,6 +171,8 @@ class LoadBuilder:
         self._note_ends()
         self._others, self._dispatch_ns = [np.empty((0, 4), dtype=np.int64)], np.empty(
             0, dtype=np.int64)
+        #: Callbacks that ran where nothing was recorded.
+        self._elsewhere = dict[str, None]()
         #: By place of an execution that did not complete: how long it has run, ns.
         self._so_far = dict[int, int]()
         #: By global vertex: the address of the callback that ran as it.
@@ -181,6 +186,7 @@ class LoadBuilder:
         self._note_pieces()
         self._note_completions()
         self._note_incomplete()
+        self._note_elsewhere()
         self._note_publications()
         del self._row, self._executions
 
@@ -333,6 +339,26 @@ class LoadBuilder:
         for at, time in zip(place.tolist(), took.tolist()):
             self._so_far[at] = self._so_far.get(at, 0) + time
 
+    def _note_elsewhere(self) -> None:
+        """Let callbacks that ran elsewhere end when their first message arrived."""
+        known = self._typical()
+        for dag, publishers in zip(self._task_set.dags, map(np.array, self._publishers)):
+            took, start, end, arrived, noticed = self._of(
+                dag.index, 'took', 'start', 'end', 'arrived', 'noticed')
+            for v in reversed(topological_order(dag)):
+                first = np.where(arrived >= 0, arrived, NEVER)[:, publishers == v].min(
+                    axis=1, initial=NEVER)
+                rows = np.flatnonzero(first < NEVER)
+                key = dag.vertices[v].callback.key
+                if key in known or not len(rows):
+                    continue
+                self._elsewhere[key] = None
+                took[rows, v] = 0
+                for edge in self._edges_into[self._first[dag.index] + v]:
+                    arrived[rows, edge] = first[rows]
+                start[rows, v] = end[rows, v] = (
+                    noticed[rows] if v == dag.source else first[rows])
+
     def _split_legs(self, dag: int, rows: Ints, edges: list[int]) -> None:
         """If one execution completed all legs, only the last message's time is known."""
         end, arrived = self._of(dag, 'end', 'arrived')
@@ -446,7 +472,8 @@ class LoadBuilder:
         load = self._load(costs, others[:, 0], overheads, only_one)
         return RecordedLoad(
             load._replace(fates=self._fates(len(costs)), **columns),
-            self._numbers, demand, executions, estimated, silent, usual, transport, late)
+            self._numbers, demand, executions, estimated, silent,
+            list(self._elsewhere), usual, transport, late)
 
     def _inherited(self, ready: Ints, deadline: Ints) -> dict[str, Any]:
         """

@@ -290,6 +290,10 @@ def reschedule(
             run.name, 'it has no execution times, and none is declared for '
             f'{counted(len(work.silent), "callback")}: {listed(work.silent)}',
             'give a GRAPH that declares it')
+    if work.elsewhere:
+        warnings.append(
+            f'{run.name}: {counted(len(work.elsewhere), "callback")} ran where nothing was '
+            f'recorded, so in what-ifs they take no time: {listed(work.elsewhere)}')
     if work.silent:
         warnings.append(
             f'{run.name}: {counted(len(work.silent), "callback")} never ran in it, and no '

@@ -160,6 +160,25 @@ def test_what_never_ran_does_not_run(tmp_path, call):
     assert 1.99 <= result['callbacks']['/d:cb']['factor'] <= 2      # 2 of 4 ms
 
 
+def test_what_ran_where_nothing_was_recorded_takes_no_time(tmp_path):
+    """The trace is that of one process of a run: the second callback of a chain is in another."""
+    trace = Written(tmp_path / 'a.mcap', FORKED, 2)
+    for job in range(4):
+        trace.release(0, job, job * 20)
+        trace.run(0, 0, job, job * 20, job * 20 + 1)
+        trace.run(0, 2, job, job * 20 + 8, job * 20 + 10)
+    path = trace.end(90)
+    outcome = reschedule(path)
+    ran = [(time // MS - start // MS, start // MS, vertex) for start, (time, _, _, _, vertex, _)
+           in executions(outcome.log)]
+    first = ran[0][1]
+    assert [(took, start - first) for took, start, vertex in ran if vertex == 2] == [
+        (2, job * 20 + 8) for job in range(4)]
+    assert {took for took, _, vertex in ran if vertex == 1} == {0}
+    assert (f'{path}: 1 callback ran where nothing was recorded, so in what-ifs they take no '
+            'time: /b:cb') in outcome.warnings
+
+
 def test_what_did_not_complete_takes_as_long_as_it_ran_or_longer(tmp_path):
     """A callback hangs, another one only failed, and the last execution of a third is open."""
     trace = Written(tmp_path / 'a.mcap', FORKED, 4)
