@@ -50,6 +50,7 @@ class MessageBag:
     The messages of nodes in a recording; a trace may have none.
 
     :ivar start: when its first message came, ns; ``end``: the last.
+    :ivar spins: from when timers fire, ns: in a recorded run the programs started before.
     :ivar pauses: from when to when none came (see ``trace.times``).
     :ivar topics: every topic in it.
     :ivar kinds: the type of each topic, as far as it has been loaded.
@@ -62,6 +63,7 @@ class MessageBag:
         self.name = name or path
         bag = Bag(path, (), name)
         self.start, self.end = bag.start or 0, bag.end or 0
+        self.spins = self.start
         self.pauses = [(before[1], after[0])
                        for before, after in pairwise(bag.stretches)]
         self.topics = frozenset(
@@ -153,6 +155,8 @@ def open_input(
                 f'{name}: no message is recorded in it: record it with ros2 bag record')
         begin = run.run.begin
         messages.start, messages.end = min(begin, run.run.head.time or begin), run.end
+        # an executor records the first timers and subscriptions when it begins to spin
+        messages.spins = min([begin, *(each.made for each in run.names.made)])
         messages.pauses = []
     return messages, taken
 

@@ -176,7 +176,7 @@ class Rerun:
             loop, recording, self.times, self._outputs, clock,
             Outside(task_set, self._holder.ordered_nodes, loop.warn))
         self._requests = Requests(loop, self._holder, self._registry)
-        self._timers = Timers(loop, self.times.first_release)
+        self._timers = Timers(loop, self.times.first_release, recording.spins)
         self._host = RerunHost(loop)
 
     def _install(self, replacements: Replacements) -> None:

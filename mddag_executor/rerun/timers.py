@@ -10,7 +10,8 @@ period after it was made or reset, and each period after that. Where a recorded 
 the timer's DAG, it is due first when the first of these was released, so that it keeps their
 phase.
 After a pause of the recording (see ``loop``) it keeps its phase. No timer is due any more when
-the recording ends.
+the recording ends. In a recorded run timers that were made before the executor began to spin fired
+once then, and so they do here.
 """
 
 from __future__ import annotations
@@ -42,10 +43,13 @@ class Timers:
     The timers of a run.
 
     :param first_release: returns when the first job of a DAG was released in the recording.
+    :param spins: before this time no timer fires, ns.
     """
 
-    def __init__(self, loop: Loop, first_release: Callable[[int], int | None]) -> None:
-        self._loop = loop
+    def __init__(
+        self, loop: Loop, first_release: Callable[[int], int | None], spins: int
+    ) -> None:
+        self._loop, self._spins = loop, spins
         self._first_release = first_release
         self._known: dict[Timer, _TimerState] = {}
 
@@ -83,7 +87,8 @@ class Timers:
             if not known.entity.rclpy_object.is_canceled():
                 known.due = due
         if 0 <= known.due < self._loop.end:
-            self._loop.at(self._loop.after_pause(due), TIMER, self._fire, known, due)
+            at = max(self._loop.after_pause(due), self._spins)
+            self._loop.at(at, TIMER, self._fire, known, due)
 
     def _fire(self, known: _TimerState, due: int) -> None:
         timer, engine, now = known.entity.rclpy_object, self._loop.engine, self._loop.now

@@ -49,6 +49,7 @@ import yaml
 
 from ..executor.conftest import wait_for
 from ..sources.bags import BEGIN, HEADER, header, SQLITE, write
+from ..sources.helpers import ns, Written
 from .helpers import GRAPH, MS, run_filter, START, write_bag
 
 GAIN = 2.0
@@ -645,3 +646,28 @@ def test_a_sync_of_two_rates_answers_its_driving_messages(tmp_path):
     # the boxes come at most 70 ms after the scan
     assert 15 * MS < sink['response_ns']['max'] <= 85 * MS
     assert verdicts(replay(trace).result()) == verdicts(result)
+
+
+def test_timers_of_a_recorded_run_do_not_fire_while_its_programs_started(tmp_path):
+    """They did not in that run: those that were due by then fired once."""
+    text = 'mddag: 1\nnodes: [{node: /n, callbacks: [{name: work, timer: 100ms, deadline: 90ms}]}]'
+    trace = Written(tmp_path / 'run.mcap', text)
+    trace.add('rcl_node_init', 1000, 1, 1, 'n', '/')
+    trace.add('rcl_timer_init', 1005, 2, 100 * MS)
+    for job in range(5):
+        trace.release(0, job, 1090 + 100 * job)
+        trace.run(0, 0, job, 1090 + 100 * job, 1091 + 100 * job)
+    path, fired = trace.end(1500), {'work': [], 'other': []}
+
+    class Worker(Node):
+        def __init__(self):
+            super().__init__('n')
+            for name, period in ('work', 0.1), ('other', 0.02):
+                self.create_timer(period, partial(self.note, name))
+
+        def note(self, name):
+            fired[name].append((self.get_clock().now().nanoseconds - ns(0)) // MS)
+
+    rerun(path, loads(text), [Worker])
+    assert fired == {'work': [1090 + 100 * job for job in range(5)],
+                     'other': [1005, *range(1020, 1500, 20)]}
