@@ -76,8 +76,9 @@ class RecordedLoad(NamedTuple):
     ``jobs`` has, by DAG, the recorded index of each job; ``demand`` the execution times of all
     declared jobs, ns; ``estimated`` counts vertices of jobs without a recorded execution time,
     ``executions`` counts all; ``silent`` names callbacks that never ran, ``elsewhere`` those that
-    ran where nothing was recorded. ``dispatches`` is the dispatch part of ``load.costs``; it is empty without overheads. ``dispatch_ns`` and
-    ``transport_ns`` are measured medians, None if nothing was measured.
+    ran where nothing was recorded. ``dispatches`` is the dispatch part of ``load.costs``; it is
+    empty without overheads. ``dispatch_ns`` and ``transport_ns`` are measured medians, None if
+    nothing was measured.
     """
 
     load: Workload
