@@ -46,7 +46,7 @@ _SUMMARY = (*_USED, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX, Opcode.METADATA
             Opcode.SUMMARY_OFFSET)
 _PRIVATE = 0x80     # opcodes from here on belong to others
 _CHUNK_HEAD = 256   # bytes; the name of the compression is short
-_AHEAD = 4096       # bytes that are read at once: heads of records, and short records
+_AHEAD = 1 << 15    # bytes that are read at once: heads of records, and short records
 MOST_OTHERS = 50_000
 """Records without messages, or definitions of these, of a file or of a block."""
 _MOST_INDEXES = 1 << 16     # of a chunk: one for each channel

@@ -325,11 +325,13 @@ class Reading:
 
         :param borders: where the blocks begin in the data, and where the last one ends.
         """
-        at, lengths, channels = _indexed(data, some, borders)
+        at, lengths, channels, limits = _indexed(data, some, borders)
         # definitions are between the messages; without usable indexes, so are all messages
-        ends = np.sort(np.concatenate((borders[:-1], at + _CONTENT + lengths)), kind='stable')
-        begins = np.sort(np.concatenate((at, borders[1:])), kind='stable')
+        first = np.append(at, borders[-1])[np.searchsorted(at, borders[:-1])]
+        ends = np.append(borders[:-1], at + _CONTENT + lengths)
+        begins = np.append(np.minimum(first, borders[1:]), limits)
         gaps = np.flatnonzero(ends < begins)
+        gaps = gaps[np.argsort(ends[gaps])]
         found: list[Ints] = []
         defect = None
         for begin, until in zip(ends[gaps].tolist(), begins[gaps].tolist()):
@@ -402,12 +404,12 @@ class Reading:
             fixed = self._channels.fixed.get(channel)
             if fixed is not None:
                 plain = lengths >= _LEAST + fixed.kind.itemsize
-                rows = rows_at(loaded.data, fixed.kind, at[plain] + _LEAST)
+                rows = rows_at(loaded.data, fixed.kind, _chosen(at, plain) + _LEAST)
                 is_plain = np.ndarray(len(rows), '<u2', rows, 0, rows.strides) == _PLAIN
                 plain[plain] = is_plain
-                tables.append(Table(fixed.head, with_fields(
-                    rows if is_plain.all() else rows[is_plain], fixed.missing),
-                    at[plain] + self._place))
+                tables.append(Table(
+                    fixed.head, with_fields(_chosen(rows, is_plain), fixed.missing),
+                    _chosen(at, plain) + self._place))
                 at, lengths = at[~plain], lengths[~plain]
             for start, length in zip(at.tolist(), lengths.tolist()):
                 event = self._any(channel, bytes(loaded.data[start:start + length]))
@@ -475,12 +477,21 @@ def _by_channel(channels: Any) -> Iterator[tuple[int, Ints]]:
         yield channel, order[end - int(counts[channel]):end]
 
 
+def _chosen(column: Any, which: Any) -> Any:
+    """Return the chosen rows of a column, which mostly are all rows."""
+    return column if which.all() else column[which]
+
+
 def _indexed(
     data: memoryview, some: Sequence[Block], borders: Ints
-) -> tuple[Ints, Ints, Any]:
-    """Return what the message indexes say of blocks' messages; nothing if they are wrong."""
+) -> tuple[Ints, Ints, Any, Ints]:
+    """
+    Return what the message indexes say of blocks' messages; nothing if they are wrong.
+
+    :returns: positions, lengths, channels, and where the next message or the end of the block is.
+    """
     none = np.empty(0, dtype=np.int64)
-    nothing = none, none, none.astype(np.uint16)
+    nothing = none, none, none.astype(np.uint16), none
     parts = [none]
     for block, begin in zip(some, borders.tolist()):
         for index in block.indexes:
@@ -495,8 +506,8 @@ def _indexed(
         return nothing
     heads = rows_at(data, _HEAD, at)
     lengths = heads['length'].astype(np.int64)
-    ends = np.repeat(borders[1:], np.diff(np.searchsorted(at, borders)))    # of the blocks
-    ends[:-1] = np.minimum(ends[:-1], at[1:])
+    limits = np.repeat(borders[1:], np.diff(np.searchsorted(at, borders)))
+    limits[:-1] = np.minimum(limits[:-1], at[1:])
     fits = (heads['opcode'] == Opcode.MESSAGE) & (lengths >= records.MESSAGE_HEAD.size) & (
-        lengths <= len(data)) & (at + _CONTENT + lengths <= ends)
-    return (at, lengths, heads['channel']) if fits.all() else nothing
+        lengths <= len(data)) & (at + _CONTENT + lengths <= limits)
+    return (at, lengths, heads['channel'], limits) if fits.all() else nothing
