@@ -25,8 +25,8 @@ from rclpy.timer import Rate
 from std_msgs.msg import Header, Int32
 from std_srvs.srv import Trigger
 
-from .conftest import matched, patience, Pulse, Spinning, wait_for
-from .inside import functions_of_tasks, pool_of
+from .conftest import is_idle, matched, patience, Pulse, Spinning, wait_for
+from .inside import functions_of_tasks, pool_of, registry_of
 
 MS = 1_000_000
 
@@ -473,3 +473,59 @@ def test_messages_that_a_group_keeps_waiting_are_as_many_as_the_qos_says(make_ex
         future.set_result(None)
         assert wait_for(lambda: group.ended == 3)
     assert steps == [(what, number) for number in (7, 8, 9) for what in ('begins', 'ends')]
+
+
+class Deciding(Tokens):
+    """A group that does something before it refuses for the first time."""
+
+    def __init__(self, meanwhile):
+        super().__init__()
+        self._meanwhile = meanwhile
+
+    def can_execute(self, entity):
+        meanwhile, self._meanwhile = self._meanwhile, lambda: None
+        meanwhile()
+        return super().can_execute(entity)
+
+
+def test_messages_that_come_while_a_group_decides_replace_the_refused_one(
+        make_executor, make_node):
+    node, got = make_node(), []
+    group = Deciding(lambda: [publisher.publish(Int32(data=number)) for number in (2, 3)])
+    node.create_subscription(
+        Int32, '/gated', lambda message: got.append(message.data), 2, callback_group=group)
+    publisher = node.create_publisher(Int32, '/gated', 10)
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        matched(publisher)
+        publisher.publish(Int32(data=1))
+        assert wait_for(lambda: executor.statistics()['queue'] == 2)
+        group.give(3)
+        assert wait_for(lambda: len(got) == 2 and is_idle(executor))
+    assert got == [2, 3] and sum(executor.statistics()['dropped'].values()) == 1
+
+
+def test_a_timer_that_is_due_again_while_its_group_decides_runs_twice(make_executor, make_node):
+    """The time that the group has refused is not dropped for the new one."""
+    node, ran = make_node(), []
+    group = Deciding(lambda: wait_for(lambda: executor.statistics()['queue']))
+    node.create_timer(0.005, lambda: ran.append(1), callback_group=group)
+    executor = make_executor(num_workers=2, nodes=[node])
+    with Spinning(executor):
+        assert wait_for(lambda: group.asked)
+        group.give(2)
+        assert wait_for(lambda: len(ran) == 2)
+        assert executor.statistics()['dropped'] == {}
+
+
+def test_what_is_destroyed_while_its_group_decides_waits_no_longer(make_executor, make_node):
+    node = make_node()
+    group = Deciding(lambda: (
+        node.destroy_guard_condition(guard), wait_for(lambda: guard not in [
+            each.rclpy_object for each in registry_of(executor).by_id.values()])))
+    guard = node.create_guard_condition(lambda: None, group)
+    executor = make_executor(nodes=[node])
+    with Spinning(executor):
+        guard.trigger()
+        assert wait_for(lambda: group.asked and is_idle(executor))
+    assert sum(executor.statistics()['dropped'].values()) == 1

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 from mddag_executor.executor import pausing, publishing
 from mddag_executor.executor.compat import function_of_task
+from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.pausing import can_pause
 from mddag_executor.executor.work import current
 from msg_graph import loads
@@ -23,7 +24,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import Declared, graph
-from .inside import engine_of, pool_of, registry_of
+from .inside import engine_of, functions_of_tasks, pool_of, registry_of
 
 MS = 1_000_000
 
@@ -220,6 +221,62 @@ def test_no_thread_looks_all_the_time_because_something_less_urgent_waits(comput
     assert computing.order('patient') == ['begins', 'ends', 'patient']
     # at most one a millisecond; if they are set to times that are over, it is four
     assert len(looks) < 30 + (steps[-1] - steps[0]) / 0.0006
+
+
+def test_a_new_timer_is_noticed_while_a_callback_computes(make_executor, make_node):
+    """Though no thread waits for events, and nothing else may come that is urgent."""
+    ran, ends = [], []
+
+    def long():
+        node.create_timer(0.01, lambda: ran.append(1), ReentrantCallbackGroup())
+        end = time.monotonic() + 15.0
+        while not ran and time.monotonic() < end:
+            compute(1)
+        ends.append(len(ran))
+
+    text = graph(node="""
+        name: long, subscription: /long, period: 1s, deadline: 60s, holds_interpreter: true
+        name: urgent, timer: 10ms, deadline: 10ms""")
+    node = make_node()
+    node.create_subscription(
+        Header, '/long', lambda message: long(), 10, callback_group=ReentrantCallbackGroup())
+    publisher = make_node('publishes').create_publisher(Header, '/long', 10)
+    with Spinning(make_executor(loads(text), nodes=[node], default_deadline='60s')):
+        matched(publisher)
+        publisher.publish(Header())
+        assert wait_for(lambda: ends, 20.0)
+    assert ends[0]
+
+
+def test_what_a_thread_asks_for_starts_though_a_callback_that_usually_computes_waits(
+        make_executor, make_node):
+    """A parked thread checks that callback: nothing else would wake one."""
+    node, begun, done = make_node(), threading.Event(), threading.Event()
+    waits = []
+
+    def callback():
+        if waits:
+            begun.set()
+            waits.append(done.wait(20.0))
+
+    def task():
+        done.set()
+
+    guard = node.create_guard_condition(callback)
+    executor = make_executor(num_workers=2, nodes=[node], default_deadline='60s')
+    with Spinning(executor):
+        assert wait_for(executor.create_task(task).done)
+        done.clear()
+        guard.trigger()
+        assert wait_for(lambda: any(each.ran for each in registry_of(executor).by_id.values()))
+        for entity in (*functions_of_tasks(executor), *registry_of(executor).by_id.values()):
+            entity.habit = GilHabit(True)
+        waits.append(None)
+        guard.trigger()
+        assert begun.wait(20.0)
+        executor.create_task(task)
+        assert wait_for(lambda: len(waits) == 2, 25.0)
+    assert waits[1]
 
 
 @pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')

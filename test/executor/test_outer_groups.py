@@ -4,11 +4,13 @@
 
 import threading
 
+from mddag_executor.executor import lending
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 
 from .conftest import matched, Spinning, wait_for
+from .inside import pool_of
 
 FAR_S = 15.0
 
@@ -105,3 +107,40 @@ def test_what_is_dropped_while_it_waits_has_waited(make_executor, make_node):
         assert executor.statistics()['dropped']
         go_on.set()
         assert wait_for(task.done)
+
+
+def test_a_callback_that_has_waited_does_not_overlap_with_one_of_its_program(
+        make_executor, monkeypatch):
+    """It goes on when that one ends, though both workers are idle or wait."""
+    monkeypatch.setattr(lending, 'ALONE_NS', 10 ** 15)
+    monkeypatch.setattr(lending, 'REJOIN_NS', 1_000_000)
+    executor, ran = make_executor(num_workers=2), []
+    answer, end = threading.Event(), threading.Event()
+
+    def asks():
+        ran.append('asks')
+        with executor.lend():
+            answer.wait(FAR_S)
+        ran.append('goes on')
+
+    def other():
+        ran.append('other')
+        end.wait(FAR_S)
+        ran.append('ends')
+
+    group = executor.new_outer_group(is_single=True)
+    group.open(1)
+    checks = []
+    all_wait = pool_of(executor).lending._all_wait
+    monkeypatch.setattr(
+        pool_of(executor).lending, '_all_wait', lambda known: checks.append(1) or all_wait(known))
+    with Spinning(executor):
+        tasks = [executor.create_task_in(group.number, asks)]
+        assert wait_for(lambda: ran == ['asks'])
+        tasks.append(executor.create_task_in(group.number, other))
+        assert wait_for(lambda: ran == ['asks', 'other'])
+        answer.set()
+        assert wait_for(lambda: len(checks) > 40)
+        end.set()
+        assert wait_for(lambda: all(task.done() for task in tasks))
+    assert ran == ['asks', 'other', 'ends', 'goes on']

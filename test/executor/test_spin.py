@@ -774,3 +774,37 @@ def test_a_signal_s_handler_may_publish(where):
         name: tick, timer: 10ms, publishes: [/command]
         name: obey, subscription: /command, deadline: 1s""")
     assert run_program(PUBLISHES, where, text)[0] == '200 200\n'
+
+
+def test_what_arrives_while_a_spin_ends_is_for_the_next_one(make_executor, make_node):
+    """The thread that waits for events may get the last one after the end has begun."""
+    node, ran, handled = make_node(), [], threading.Event()
+    guard = node.create_guard_condition(lambda: ran.append(1))
+    executor, future = make_executor(num_workers=1, nodes=[node]), Future()
+    pool = pool_of(executor)
+    receive = pool._receive
+
+    def end_before(me, events):
+        ends = is_to_end and events is not None
+        if ends:
+            pool.start_no_more()
+        try:
+            return receive(me, events)
+        finally:
+            if ends:
+                handled.set()
+
+    is_to_end = []
+    pool._receive = end_before
+    thread = threading.Thread(target=executor.spin_until_future_complete, args=(future,))
+    thread.start()
+    assert wait_for(lambda: pool.is_current and pool.polling)
+    is_to_end.append(1)
+    guard.trigger()
+    assert handled.wait(15.0)
+    future.set_result(None)
+    thread.join(15.0)
+    is_to_end.clear()
+    assert not ran
+    with Spinning(executor):
+        assert wait_for(lambda: ran)
