@@ -204,13 +204,13 @@ class DueTimes:
 
     def arm_for_new(self, now: int) -> None:
         """
-        Let a thread wake up for new appointments and entities as well.
+        Let a parked thread look for new appointments and entities as well.
 
-        The caller starts nothing, so the time of a look that was set before stays.
+        The caller starts nothing, so the time of a look that was set before stays.  A thread in
+        the epoll wakes up for each new entity anyway: its descriptor is ready at first.
         """
-        if self._pool.polling or self._pool.is_spin_once:
-            self.arm_by(self._agenda.next)
-        elif self._pool.running and self._pool.engine.is_busy:
+        pool = self._pool
+        if pool.running and pool.engine.is_busy and not (pool.polling or pool.is_spin_once):
             self.arm_by(self._next_look(now))
 
     def arm_idle(self, now: int) -> None:

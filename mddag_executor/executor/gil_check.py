@@ -109,7 +109,7 @@ def _gil_address() -> int:
     try:
         for _ in range(LOOKS):
             _libc.usleep(LOOK_US)
-            address = _first_argument(thread.native_id or 0) & ~7  # one of two words, alternately
+            address = _first_argument(thread.native_id or 0)
             # no address is as small as the first argument of ``sleep``
             if address == before > GIL_BYTES:
                 return address

@@ -70,7 +70,7 @@ class Starter:
     def claim(self, topic: str, message: Any) -> Claim | None:
         """Return the execution, which publishes a message; None: it has ended, or has no job."""
         work, pool = self._work(), self._pool()
-        if work is None or pool is None or pool.is_inside():
+        if work is None or pool is None:
             return None
         engine = pool.engine
         with pool.lock:     # it does not end meanwhile
