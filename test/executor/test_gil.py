@@ -263,20 +263,61 @@ def test_what_a_thread_asks_for_starts_though_a_callback_that_usually_computes_w
         done.set()
 
     guard = node.create_guard_condition(callback)
-    executor = make_executor(num_workers=2, nodes=[node], default_deadline='60s')
+    executor = make_executor(num_workers=2, nodes=[node], default_deadline='1000s')
     with Spinning(executor):
         assert wait_for(executor.create_task(task).done)
         done.clear()
         guard.trigger()
         assert wait_for(lambda: any(each.ran for each in registry_of(executor).by_id.values()))
         for entity in (*functions_of_tasks(executor), *registry_of(executor).by_id.values()):
-            entity.habit = GilHabit(True)
+            entity.habit, entity.wall_ns = GilHabit(True), 100 * MS
         waits.append(None)
         guard.trigger()
         assert begun.wait(20.0)
         executor.create_task(task)
         assert wait_for(lambda: len(waits) == 2, 25.0)
     assert waits[1]
+
+
+def test_a_callback_that_waits_starts_at_once_while_another_one_computes(
+        make_executor, make_node, monkeypatch):
+    """A thread waits for its messages then, though nothing that comes is urgent."""
+    monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
+    ran, begun = [], threading.Event()
+
+    def long():
+        begun.set()
+        end = time.monotonic() + 15.0
+        while 'waits' not in ran and time.monotonic() < end:
+            compute(1)
+        ran.append('long')
+
+    text = declare(*(
+        (name, f'subscription: /{name}, period: 1s, deadline: 1000s{holds}')
+        for name, holds in (('long', ', holds_interpreter: true'), ('waits', ''))))
+    nodes = Declared(make_node, text, {
+        'long': long, 'waits': lambda: (time.sleep(0.01), ran.append('waits'))})
+    publishers = [make_node('p').create_publisher(Header, topic, 10)
+                  for topic in ('/long', '/waits')]
+    executor = make_executor(
+        loads(text), nodes=nodes.nodes.values(), default_deadline='1000s')
+    with Spinning(executor):
+        matched(*publishers)
+        for entity in registry_of(executor).by_id.values():
+            if entity.topic == '/waits':
+                entity.habit = GilHabit(False)  # as if it had been learnt
+        for count, publisher in enumerate(reversed(publishers), 1):
+            publisher.publish(Header())     # so it is known how long each takes
+            assert wait_for(lambda n=count: len(ran) == n and is_idle(executor))
+        for entity in registry_of(executor).by_id.values():
+            entity.wall_ns = 100 * MS
+        ran.clear()
+        begun.clear()
+        publishers[0].publish(Header())
+        assert begun.wait(15.0)
+        publishers[1].publish(Header())
+        assert wait_for(lambda: len(ran) == 2, 20.0)
+    assert ran == ['waits', 'long']
 
 
 @pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
