@@ -12,7 +12,7 @@ from mddag_executor.core.jobs import source_depth
 from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
-from mddag_executor.executor import due
+from mddag_executor.executor import due as due_module
 from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
@@ -753,7 +753,7 @@ def test_a_late_wake_up_is_no_stop_if_all_threads_ran_callbacks(
         make_executor, monkeypatch, waits_since, computed, stops):
     """No thread waited for the timer then; nor if the process computed meanwhile."""
     pool, used, found = pool_of(make_executor()), [0], []
-    monkeypatch.setattr(due, 'process_time_ns', lambda: used[0])
+    monkeypatch.setattr(due_module, 'process_time_ns', lambda: used[0])
     monkeypatch.setattr(pool.engine, 'machine_stopped', lambda *times: found.append(times))
     now = pool.clock.now()
     begin = now - 100 * MS - pool.offset
