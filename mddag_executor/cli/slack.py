@@ -71,8 +71,7 @@ def main(args: argparse.Namespace) -> int:
     common.recording_and_graph(args)
     is_graph = is_declaration(str(args.trace))
     problem, task_set, dags, processes, required = (_of_graph if is_graph else _of_trace)(args)
-    callbacks = len(set(problem.callback_of))
-    with Progress('searching', callbacks) as line:
+    with Progress('searching', len(problem.callbacks)) as line:
         slack = find_slack(problem, line.update, args.parallel or defaults.processors())
     result = slack_result(slack, task_set, dags, processes, required)
     if args.report is not None:
@@ -103,8 +102,10 @@ def _of_trace(args: argparse.Namespace) -> _Given:
             skip=args.begin or 0, cpus=args.cpus)
     warn(*outcome.warnings)
     work = outcome.work
-    problem = Problem(work.load, outcome.settings, outcome.tables,
-                      outcome.task_set.places_of_vertices(), work.dispatches)
+    number = outcome.task_set.callback_indices()
+    problem = Problem(
+        work.load, outcome.settings, outcome.tables, outcome.task_set.places_of_vertices(),
+        work.dispatches, frozenset(number[key] for key in (*work.silent, *work.elsewhere)))
     result = outcome.result()
     return (problem, outcome.task_set, result['dags'], outcome.processes,
             result.get('requirements', {}))

@@ -98,6 +98,7 @@ class Problem(NamedTuple):
     :ivar load: a recorded load, or a periodic one.
     :ivar callback_of: by global vertex the number of its callback.
     :ivar dispatches: the dispatch part of the first of ``load.costs``.
+    :ivar untimed: callbacks whose times are not known: no factor says anything of them.
     """
 
     load: Workload
@@ -105,6 +106,12 @@ class Problem(NamedTuple):
     tables: Tables
     callback_of: list[int]
     dispatches: Any = ()
+    untimed: frozenset[int] = frozenset()
+
+    @property
+    def callbacks(self) -> list[int]:
+        """Return the numbers of the callbacks to search for."""
+        return sorted({*self.callback_of} - self.untimed)
 
 
 class Found(NamedTuple):
@@ -364,7 +371,7 @@ def find_slack(
     """
     search = Search(problem)
     progress(0)
-    rest = sorted(set(problem.callback_of))
+    rest = problem.callbacks
     found = {ALL: search.factor(ALL)}
     progress(0)
     begin, quick = time.monotonic(), True

@@ -157,6 +157,7 @@ def test_what_never_ran_does_not_run(tmp_path, call):
             'what-ifs leave out: /b:cb, /c:cb, /e:cb') in outcome.warnings
     result = call('slack', path, '--json', '-').result
     assert result['left_out'] == ['/c:cb', '/e:cb']
+    assert [*result['callbacks']] == ['/a:cb', '/d:cb']
     assert 1.99 <= result['callbacks']['/d:cb']['factor'] <= 2      # 2 of 4 ms
 
 
