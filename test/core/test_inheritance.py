@@ -182,6 +182,84 @@ def test_a_late_queue_stays_late_when_an_inherited_deadline_is_over():
     assert started(core, now, 2) == [other, request]
 
 
+def test_a_fresh_execution_of_a_late_queue_passes_on_what_it_inherits():
+    core = new_core(default=10 * TICK)
+    queue, now = core.new_queue(), 11 * TICK
+    late = core.ready_undeclared(0, -1, 0, queue, 0)
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), now)
+    fresh = core.ready_undeclared(0, -1, 0, queue, now)
+    core.take(0, now)
+    core.complete(other, now)
+    assert started(core, now, 1) == [late]
+    request = core.ready_undeclared(0, -1, 0, queue, 15 * TICK)
+    core.inherit(request, 23 * TICK, 1)
+    assert core.take(0, 16 * TICK) == fresh and core.heritage(fresh) == (23 * TICK, 1)
+
+
+def test_the_first_one_inherits_from_the_request_that_is_not_over():
+    """The priority, and the vertex that has it."""
+    core = new_core()
+    queue = core.new_queue()
+    first, *requests = (core.ready_undeclared(0, -1, 0, queue, 0) for _ in range(3))
+    core.inherit(requests[1], 20 * TICK, 1)
+    core.inherit(requests[0], 10 * TICK, 0)
+    assert core.take(0, 15 * TICK) == first and core.heritage(first) == (20 * TICK, 1)
+
+
+def test_what_an_execution_has_inherited_is_not_of_the_next_one_in_its_slot():
+    core = new_core()
+    request = core.ready_undeclared(0, -1, 0, core.new_queue(), 0)
+    core.inherit(request, 50 * TICK, 0)
+    assert started(core, 0, 1) == [request]
+    queue = core.new_queue()
+    first = core.ready_undeclared(0, -1, 0, queue, TICK)
+    assert first == request     # the slot is used again
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), 0)
+    core.inherit(core.ready_undeclared(0, -1, 0, queue, TICK), 30 * TICK, 0)
+    assert started(core, 31 * TICK, 2) == [other, first]
+
+
+def test_an_execution_that_goes_on_is_not_late():
+    """Though what it has inherited is over, and its own deadline as well."""
+    core = new_core(default=10 * TICK)
+    request = core.ready_undeclared(0, -1, 0, core.new_queue(), 0)
+    core.inherit(request, 8 * TICK, 0)
+    assert core.take(0, 0) == request
+    core.suspend(request)
+    core.resume(request, 0, 0, 5 * TICK)
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), 29 * TICK)
+    assert started(core, 30 * TICK, 2) == [request, other]
+
+
+def test_a_queue_stays_late_until_it_is_empty():
+    """Though its first execution is not late, and one more becomes ready."""
+    core = new_core(default=10 * TICK)
+    queue, now = core.new_queue(), 11 * TICK
+    late, fresh = (core.ready_undeclared(0, -1, 0, queue, time) for time in (0, now))
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), now)
+    assert started(core, now, 2) == [other, late]
+    newest = core.ready_undeclared(0, -1, 0, queue, 12 * TICK)
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), 13 * TICK)
+    assert started(core, 13 * TICK, 3) == [other, fresh, newest]
+
+
+def test_a_queue_stays_late_though_its_late_execution_is_dropped():
+    core = new_core(default=10 * TICK)
+    queue = core.new_queue()
+    late, fresh = (core.ready_undeclared(0, -1, 0, queue, time) for time in (0, 11 * TICK))
+    other = core.ready_undeclared(0, -1, 0, core.new_queue(), 12 * TICK)
+    core.drop(late, 12 * TICK)
+    assert started(core, 12 * TICK, 2) == [other, fresh]
+
+
+@pytest.mark.parametrize('preempts', [False, True])
+def test_nothing_overtakes_a_callback_that_ends_before_python_switches(preempts):
+    core = new_core(default=1)
+    urgent = core.ready_undeclared(0, -1, 0, core.new_queue(), 1)
+    assert [overtaking_pays(core.tables, core.state, urgent, 0, usual, preempts)
+            for usual in (999_999, 1_000_000)] == [False, True]
+
+
 @pytest.mark.parametrize('suspends', [False, True])
 def test_what_is_over_is_not_inherited_any_more(suspends):
     """A late job takes nothing down by its requests; they are like any other then."""

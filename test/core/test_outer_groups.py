@@ -218,3 +218,17 @@ def test_the_number_of_a_freed_outer_group_is_used_again_when_none_of_it_is_left
     assert core.new_outer_group() == first
     assert core.new_outer_group() not in (first, other)
     assert core.state.outer_limit[first] == 0
+
+
+def test_one_that_is_dropped_leaves_the_place_to_the_next():
+    core = Run(0).core
+    outer = core.new_outer_group()
+    core.open_outer(outer, 1)
+    several = []
+    for now in range(3):
+        several.append(core.ready_undeclared(0, -1, 0, core.new_queue(), now))
+        core.state.x_outer[several[-1]] = outer
+    assert core.take(0, 3) == several[0] and core.take(1, 3) == -1
+    core.complete(several[0], 4)
+    core.drop(several[1], 4)    # it would have been next
+    assert core.take(0, 4) == several[2]
