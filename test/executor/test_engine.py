@@ -748,6 +748,20 @@ def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
     assert found == [NEVER, 121, 120, NEVER, 170, 170, 150]
 
 
+def test_no_thread_is_woken_for_a_busy_group_but_for_its_owner():
+    engine = new_engine(workers=2)
+    group = engine.scheduler.new_group()
+    owner, other = new_entity(group), new_entity(group)
+    engine.ready(Work(owner, print), 0)
+    work = engine.step(0, 0).work
+    engine.ready(Work(other, print), 1)
+    assert not engine.may_start_more(1)
+    engine.suspended(work, 0, 2, 0, work.worker)
+    assert not engine.may_start_more(2)
+    engine.resume(work, 3)
+    assert engine.may_start_more(3)
+
+
 @pytest.mark.parametrize('waits_since, computed, stops', [(0, 0, 1), (100, 0, 0), (0, 90, 0)])
 def test_a_late_wake_up_is_no_stop_if_all_threads_ran_callbacks(
         make_executor, monkeypatch, waits_since, computed, stops):
