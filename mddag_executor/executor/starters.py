@@ -6,11 +6,11 @@ Code that a callback starts and that publishes for it: threads, tasks, later par
 Theory of operation
 -------------------
 1.  A callback may leave publishing to code that runs elsewhere: a task of asyncio, a function in a
-    ``ThreadPoolExecutor`` (``submit``, ``run_in_executor``, ``to_thread``), a thread or
-    ``threading.Timer``, a task of an executor.  Until the execution of the callback has ended,
-    such code works *on its behalf*: what it publishes belongs to the execution, as if the callback
-    had published it.  So if the callback awaits or joins such code, the messages belong to its
-    job.
+    ``ThreadPoolExecutor`` (``submit``, ``run_in_executor``, ``to_thread``) or in a ``ThreadPool``
+    of multiprocessing, a thread or ``threading.Timer``, a task of an executor.  Until the
+    execution of the callback has ended, such code works *on its behalf*: what it publishes belongs
+    to the execution, as if the callback had published it.  So if the callback awaits or joins such
+    code, the messages belong to its job.
 2.  The execution that has started the code is its *starter*.  It is noted when the code starts:
 
     * of a thread, in the thread (``Thread.start``);
@@ -30,7 +30,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 import contextvars
-from functools import wraps
+from functools import partial, wraps
+from multiprocessing.pool import ThreadPool
 import threading
 from typing import Any, NamedTuple
 import weakref
@@ -38,6 +39,8 @@ import weakref
 from mddag_executor.executor.attribution import Origin
 
 _ATTRIBUTE = '_mddag_starter'
+_OF_POOLS = ('apply_async', 'map', 'map_async', 'starmap', 'starmap_async', 'imap',
+             'imap_unordered')    # ``apply`` calls the first one
 
 
 class Claim(NamedTuple):
@@ -158,5 +161,26 @@ def install(starter_here: Callable[[], Starter | None]) -> None:
         with starting_for_all():  # its threads also run functions that others submit
             return submit(self, run_for, starter, function, *args, **kwargs)
 
+    def with_starter(method: Any) -> Any:
+        @wraps(method)
+        def run_with_starter(
+            self: ThreadPool, func: Callable[..., Any], *args: Any, **kwargs: Any
+        ) -> Any:
+            starter = starter_here()
+            if starter is not None:
+                func = partial(run_for, starter, func)
+            return method(self, func, *args, **kwargs)
+        return run_with_starter
+
+    make: Any = ThreadPool.__init__
+
+    @wraps(make)
+    def make_pool(self: ThreadPool, *args: Any, **kwargs: Any) -> None:
+        with starting_for_all():
+            make(self, *args, **kwargs)
+
+    ThreadPool.__init__ = make_pool  # type: ignore[method-assign]
+    for name in _OF_POOLS:
+        setattr(ThreadPool, name, with_starter(getattr(ThreadPool, name)))
     threading.Thread.start = start_thread  # type: ignore[method-assign]
     ThreadPoolExecutor.submit = submit_with_starter  # type: ignore[assignment,method-assign]

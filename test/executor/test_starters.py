@@ -8,7 +8,9 @@ It belongs to the execution if that has not ended; else a line says so: see ``st
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 import inspect
+from multiprocessing.pool import ThreadPool
 import threading
 
 from mddag_executor import replay
@@ -58,7 +60,7 @@ class Detector:
         self.threads = [threading.Thread(target=lambda: self.alarm(self.messages[-1]))
                         for _ in range(IMAGES)]
         self.may_go_on = threading.Event()
-        self.pool = ThreadPoolExecutor(1)
+        self.pool, self.thread_pool = ThreadPoolExecutor(1), ThreadPool(2)
 
     def alarm(self, message):
         self.publisher.publish(message)
@@ -92,6 +94,8 @@ class Detector:
                 self._run_once(number, min(n_stopped, (number + 1) // 2))
             assert wait_for(lambda: is_idle(self.executor))
         self.pool.shutdown()
+        self.thread_pool.terminate()
+        self.thread_pool.join()
         return self.watch.drift(self.executor.statistics())
 
     def _run_once(self, number, n_stopped):
@@ -202,6 +206,32 @@ def a_map_over_threads(each, message):
             pass
 
 
+def a_pool_of_multiprocessing(each, message):
+    each.thread_pool.apply(each.alarm, (message,))
+
+
+def parts(message):
+    """Return what functions of pools get in two calls, one of which publishes."""
+    return [(None,), (message,)]
+
+
+def in_parts(method, is_starmap=False):
+    """Return a callback that publishes by a method of a pool that gets an iterable."""
+    def publish(each, message):
+        def alarm(part):
+            if not is_starmap:
+                part, = part
+            if part is not None:
+                each.alarm(part)
+
+        found = getattr(each.thread_pool, method)(alarm, parts(message))
+        if hasattr(found, 'get'):
+            found = found.get(60.0)
+        assert [*found] == [None, None]
+    publish.__name__ = f'a_{method}_of_multiprocessing'
+    return publish
+
+
 def a_loop_over_a_generator(each, message):
     for made in (Header(frame_id=message.frame_id) for _ in range(1)):
         each.alarm(made)
@@ -211,7 +241,9 @@ IN_TIME = [
     in_a_later_piece, after_a_sleep_of_asyncio, run_in_executor, to_thread, a_task_of_asyncio,
     a_thread_of_a_task_of_asyncio, a_task, a_task_of_a_task, a_done_callback_of_a_future, a_thread,
     a_thread_of_a_thread, a_thread_that_was_made_before, a_timer_of_threading, a_pool_of_threads,
-    a_map_over_threads, a_loop_over_a_generator]
+    a_map_over_threads, a_pool_of_multiprocessing, *map(
+        in_parts, ('map', 'map_async', 'imap', 'imap_unordered')),
+    in_parts('starmap', True), in_parts('starmap_async', True), a_loop_over_a_generator]
 
 
 @pytest.mark.parametrize('publish', IN_TIME)
@@ -237,6 +269,10 @@ def a_thread_that_goes_on(each, message):
 
 def a_pool_that_goes_on(each, message):
     each.pool.submit(each.alarm_later, message)
+
+
+def a_pool_of_multiprocessing_that_goes_on(each, message):
+    each.thread_pool.apply_async(each.alarm_later, (message,))
 
 
 async def a_task_of_asyncio_that_goes_on(each, message):
@@ -270,6 +306,7 @@ def a_timer_of_the_node(each, message):
 
 TOO_LATE = {
     a_thread_that_goes_on: 'threads of its own', a_pool_that_goes_on: 'threads of its own',
+    a_pool_of_multiprocessing_that_goes_on: 'threads of its own',
     a_task_of_asyncio_that_goes_on: 'threads of its own',
     a_task_that_goes_on: 'alarm_later', a_response: 'on_response',
     a_service: 'service /answer', a_timer_of_the_node: '/detector: publish (timer 1ms)'}
@@ -369,12 +406,20 @@ def belongs_to_no_job(each, schedule):
     assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
 
 
-def test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it(make_executor, make_node):
+@pytest.mark.parametrize(('make', 'use'), [
+    (lambda each: each.pool, lambda pool, run, *args: pool.submit(run, *args).result()),
+    (lambda each: ThreadPool(1), lambda pool, run, *args: pool.apply(run, args)),
+], ids=['futures', 'multiprocessing'])
+def test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it(
+        make_executor, make_node, make, use):
     """Others submit functions as well, while the execution still runs."""
     has_made, has_published = threading.Semaphore(0), threading.Semaphore(0)
+    pools, to_end = [], ExitStack()
 
     def publish(each, message):
-        each.pool.submit(int).result()
+        if not pools:
+            pools.append(to_end.enter_context(make(each)))
+        use(pools[0], int)
         each.kept.append(message)
         has_made.release()
         assert has_published.acquire(timeout=60.0)
@@ -382,11 +427,12 @@ def test_a_pool_s_thread_works_for_no_execution_that_has_only_made_it(make_execu
     def submit():
         for _ in range(IMAGES // 2):
             assert has_made.acquire(timeout=60.0)
-            each.pool.submit(each.alarm, each.kept.pop()).result()
+            use(pools[0], each.alarm, each.kept.pop())
             has_published.release()
 
     each = Detector(make_executor, make_node, publish)
-    belongs_to_no_job(each, submit)
+    with to_end:
+        belongs_to_no_job(each, submit)
 
 
 def test_a_thread_of_asyncio_works_for_no_execution_that_has_only_started_it(
