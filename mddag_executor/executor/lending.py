@@ -6,8 +6,9 @@ Callbacks that wait inside ``Client.call``: they lend their workers, and rejoin.
 Theory of operation
 -------------------
 1.  *Lending.*  A callback that waits inside ``Client.call`` returns its worker to the core.  If
-    there are fewer other threads than workers, a thread is made.  At most ``MOST`` callbacks lend
-    at the same time; further ones keep their workers.
+    there are fewer other threads than workers, a thread is made first.  If it cannot be made, the
+    others do the work; without any, ``Client.call`` raises the error, since no thread would handle
+    the answer.  At most ``MOST`` callbacks lend at the same time; further ones keep their workers.
 2.  *Rejoining.*  When the callback has its answer, its execution waits in the core like any other
     one, and its thread waits for its *permit*.  The thread that dispatches the execution gives the
     worker to that thread, releases the permit, and chooses again.
@@ -105,6 +106,8 @@ class Lending:
             me.work.coroutine.let_others()
         with pool.lock:
             if not me.is_out and me.work is not None and self.n_out < MOST:
+                if me.thread is not None and pool.running:
+                    pool.need_threads(self.n_out + 1)
                 lends = me.has_lent = me.is_out = True
                 self.n_out += 1
                 self.n_lent += 1
@@ -112,8 +115,6 @@ class Lending:
                 pool.become(me, ThreadState.OUT)
                 pool.engine.lend(me.work)
                 pool.pauses.end()
-                if me.thread is not None and pool.running:
-                    pool.need_threads(self.n_out)
                 if pool.polling:
                     pool.wake_for_more()
                 else:

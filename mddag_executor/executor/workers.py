@@ -155,6 +155,7 @@ class WorkerPool:
         #: how many threads wait for events
         self.polling = 0
         self._n_parked = 0
+        self._lacks_threads = False     # that no thread could be made has been reported
         # how many callbacks are known to wait, and may get messages or requests
         self._eager = 0
         self._polled_at = 0  # when the epoll was last polled
@@ -427,9 +428,23 @@ class WorkerPool:
         return True
 
     def need_threads(self, n_out: int) -> None:
-        """Make a thread if fewer than ``n_workers`` remain when ``n_out`` have no worker."""
-        if len(self._threads) - n_out < self.engine.n_workers:
+        """
+        Make a thread if fewer than ``n_workers`` remain when ``n_out`` have no worker.
+
+        :raises RuntimeError: if none can be made, and none remains.
+        """
+        n_left = len(self._threads) - n_out
+        if n_left >= self.engine.n_workers:
+            return
+        try:
             self._new_thread()
+        except RuntimeError as error:   # there are too many
+            if not n_left:
+                raise
+            if not self._lacks_threads:
+                self._lacks_threads = True
+                self._warn(f'{error}: while callbacks wait in Client.call, fewer than '
+                           f'{self.engine.n_workers} others run')
 
     def _new_thread(self) -> WorkerThread:
         me = WorkerThread(self, None)

@@ -127,6 +127,42 @@ def worker_threads():
     return sum(thread.name.startswith('mddag-worker') for thread in threading.enumerate())
 
 
+@pytest.mark.parametrize('n_workers', [1, 2])
+def test_a_call_for_which_no_thread_can_be_made(
+        make_executor, make_node, monkeypatch, capfd, n_workers):
+    """The other workers answer; without any, it raises what a thread raises."""
+    node, start = make_node(), threading.Thread.start
+    node.create_service(
+        Trigger, '/ask', lambda request, response: response,
+        callback_group=ReentrantCallbackGroup())
+    client = node.create_client(Trigger, '/ask', callback_group=ReentrantCallbackGroup())
+    executor = make_executor(num_workers=n_workers, nodes=[node])
+
+    def limited(thread):
+        raise RuntimeError("can't start new thread")
+
+    def ask():
+        with monkeypatch.context() as limit:
+            limit.setattr(threading.Thread, 'start', limited)
+            try:
+                return client.call(Trigger.Request(), 60.0)
+            except RuntimeError as error:
+                return error
+
+    with Spinning(executor):
+        assert client.wait_for_service(60.0)
+        for _ in range(2):
+            task = executor.create_task(ask)
+            assert wait_for(task.done)
+            assert isinstance(
+                task.result(), RuntimeError if n_workers == 1 else Trigger.Response)
+        task = executor.create_task(client.call, Trigger.Request(), 60.0)
+        assert wait_for(task.done) and isinstance(task.result(), Trigger.Response)
+        assert wait_for(lambda: executor.statistics()['idle_workers'] == n_workers)
+    assert capfd.readouterr().err.count("can't start new thread: while callbacks wait in "
+                                        'Client.call, fewer than 2 others run') == n_workers - 1
+
+
 def test_blocked_calls_take_a_bounded_number_of_threads(make_executor, make_node):
     """The rest waits for a worker, and all are answered in the end."""
     answers, count, most = [], MOST + 30, MOST + 2
