@@ -27,6 +27,7 @@ import sys
 import threading
 from typing import TYPE_CHECKING
 
+from mddag_executor.executor.interrupts import InterruptsDeferred
 from mddag_executor.executor.publishing import unwatch
 from mddag_executor.executor.unfinished import unfinished
 
@@ -78,8 +79,12 @@ class Ending:
         gc.freeze()
 
     def end_run(self) -> None:
-        """Judge open jobs and close the trace, once; a second thread waits for the first."""
-        with self._lock:
+        """
+        Judge open jobs and close the trace, once; a second thread waits for the first.
+
+        An interrupt comes out of it at its end: a further ``shutdown`` would not do the rest.
+        """
+        with InterruptsDeferred(), self._lock:
             if not self._has_ended:
                 self._has_ended = True
                 self._judge_and_close()

@@ -825,9 +825,10 @@ class MultiDeadlineExecutor(BareExecutor):
         self._ending.end_run()
         reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
-        if self._spinning.acquire(blocking=False):  # else the spin does that at its end
-            self._ending.close()
-            self._spinning.release()
+        with InterruptsDeferred():  # a further call could not close the rest
+            if self._spinning.acquire(blocking=False):  # else the spin does that at its end
+                self._ending.close()
+                self._spinning.release()
         return finished and reported and in_time
 
     def abandon_callbacks(self) -> None:

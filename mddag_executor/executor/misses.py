@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.errors import from_user_code
 from mddag_executor.executor.bounds import END_S, LOG_EVERY_S
+from mddag_executor.executor.interrupts import InterruptsDeferred
 from mddag_executor.executor.shutdown import join, stop_at_exit
 from mddag_executor.text import counted
 from msg_graph.errors import printable
@@ -91,7 +92,7 @@ class MissNotifier:
         :param timeout: seconds to wait for the handler, if that is less than twice ``END_S``.
         :return: whether the handler has returned.
         """
-        with self._starting:
+        with InterruptsDeferred(), self._starting:  # else the lock might never be released
             if self._ends_at is None:
                 self._ends_at = time.monotonic() + END_S
                 self._queue.put(None)

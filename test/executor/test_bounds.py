@@ -131,7 +131,7 @@ def worker_threads():
 def test_a_call_for_which_no_thread_can_be_made(
         make_executor, make_node, monkeypatch, capfd, n_workers):
     """The other workers answer; without any, it raises what a thread raises."""
-    node, start = make_node(), threading.Thread.start
+    node = make_node()
     node.create_service(
         Trigger, '/ask', lambda request, response: response,
         callback_group=ReentrantCallbackGroup())

@@ -5,6 +5,7 @@
 import gc
 import os
 import resource
+import signal
 import sys
 import threading
 import weakref
@@ -12,6 +13,7 @@ import weakref
 from mddag_executor import MultiDeadlineExecutor
 from mddag_executor.executor import settings
 from mddag_executor.executor.compat import RCLError
+from mddag_executor.executor.ending import Ending
 from mddag_executor.executor.session import Session
 import pytest
 import rclpy
@@ -173,6 +175,32 @@ def test_shutdown_in_a_handler_that_interrupts_the_executor_itself(ros_context):
             assert not executor.shutdown()
         spinning.join()
         assert executor.is_gone() and pool_of(executor).loop._bell < 0
+
+
+@pytest.mark.parametrize('step', ['_judge_and_close', '_close_descriptors'])
+def test_a_shutdown_that_is_interrupted_leaves_nothing(ros_context, monkeypatch, step):
+    """The interrupt comes out of it when nothing is left half done."""
+    node = busy_node(ros_context)
+    with MultiDeadlineExecutor(context=ros_context) as first:  # what the middleware opens first
+        first.add_node(node)
+        run(first, node)
+    before = used()
+    executor = MultiDeadlineExecutor(context=ros_context)
+    executor.add_node(node)
+    run(executor, node)
+    do_step = getattr(Ending, step)
+
+    def interrupted(ending):
+        signal.raise_signal(signal.SIGINT)
+        do_step(ending)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Ending, step, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            executor.shutdown()
+    assert executor.shutdown()
+    assert wait_for(lambda: used() == before)
+    node.destroy_node()
 
 
 def test_an_interrupt_at_the_end_of_a_spin_leaves_an_executor_that_can_be_shut_down(monkeypatch):
