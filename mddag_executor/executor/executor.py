@@ -809,6 +809,10 @@ class MultiDeadlineExecutor(BareExecutor):
         """
         if timeout_sec is not None and not 0 <= timeout_sec < threading.TIMEOUT_MAX:
             timeout_sec = None
+        with InterruptsDeferred():  # a further call does what an interrupted one has left
+            return self._shut_down(timeout_sec, wait_for_threads)
+
+    def _shut_down(self, timeout_sec: float | None, wait_for_threads: bool) -> bool:
         self.begin_end()
         self._must_shut_down = self._pool.is_inside()
         if self._must_shut_down:
@@ -825,10 +829,9 @@ class MultiDeadlineExecutor(BareExecutor):
         self._ending.end_run()
         reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
-        with InterruptsDeferred():  # a further call could not close the rest
-            if self._spinning.acquire(blocking=False):  # else the spin does that at its end
-                self._ending.close()
-                self._spinning.release()
+        if self._spinning.acquire(blocking=False):  # else the spin does that at its end
+            self._ending.close()
+            self._spinning.release()
         return finished and reported and in_time
 
     def abandon_callbacks(self) -> None:

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import _thread
 from collections.abc import Callable
+from functools import wraps
 from importlib import import_module
 import os
 import select
@@ -35,7 +36,7 @@ import sys
 import threading
 import time
 from types import CodeType, FrameType
-from typing import Any, TypeVar
+from typing import Any, cast, TypeVar
 
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = __name__.partition('.')[0]
@@ -64,6 +65,18 @@ def runs_callbacks(function: _Function) -> _Function:
     """Mark a function that calls code of the program; before that, it has something in hand."""
     _runs_callbacks.add(function.__code__)
     return function
+
+
+def waits(function: _Function) -> _Function:
+    """Mark a function that waits in code of Python's library, and has nothing in hand."""
+    interruptible(function)
+    runs_callbacks(function)
+
+    @wraps(function)
+    def wait(*args: Any, **more: Any) -> Any:
+        _call_pending()
+        return function(*args, **more)
+    return cast(_Function, wait)
 
 
 class _Deferred:

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING
 
 from mddag_executor.errors import from_user_code
 from mddag_executor.executor.bounds import END_S, LOG_EVERY_S
-from mddag_executor.executor.interrupts import InterruptsDeferred
+from mddag_executor.executor.interrupts import InterruptsDeferred, waits
 from mddag_executor.executor.shutdown import join, stop_at_exit
 from mddag_executor.text import counted
 from msg_graph.errors import printable
@@ -98,8 +98,12 @@ class MissNotifier:
                 self._queue.put(None)
             if self._thread.ident is None:
                 return True
-        join(self._thread, 2 * END_S if timeout is None else min(timeout, 2 * END_S))
+        self._wait(2 * END_S if timeout is None else min(timeout, 2 * END_S))
         return not self._thread.is_alive() or self.is_calling()
+
+    @waits
+    def _wait(self, seconds: float) -> None:
+        join(self._thread, seconds)
 
     def _run(self) -> None:
         while True:

@@ -58,6 +58,7 @@ from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.engine import Engine, Step
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.hall import Announced, Spinner
+from mddag_executor.executor.interrupts import waits
 from mddag_executor.executor.lending import Lending
 from mddag_executor.executor.loop import EventLoop, Events, Parking
 from mddag_executor.executor.misses import MissLog
@@ -411,6 +412,7 @@ class WorkerPool:
             close()
 
     @staticmethod
+    @waits
     def _join(each: WorkerThread, deadline: int | None) -> bool:
         thread = each.thread
         if thread is None or thread is threading.current_thread():

@@ -60,7 +60,7 @@ class Detector:
         self.threads = [threading.Thread(target=lambda: self.alarm(self.messages[-1]))
                         for _ in range(IMAGES)]
         self.may_go_on = threading.Event()
-        self.pool, self.thread_pool = ThreadPoolExecutor(1), ThreadPool(2)
+        self.pool = ThreadPoolExecutor(1)
 
     def alarm(self, message):
         self.publisher.publish(message)
@@ -88,13 +88,12 @@ class Detector:
 
     def run(self, n_stopped=IMAGES // 2):
         """Run it with some images; return what differs from the declaration."""
-        with Spinning(self.executor):
+        with ThreadPool(2) as self.thread_pool, Spinning(self.executor):
             matched(self.images, self.publisher)
             for number in range(IMAGES):
                 self._run_once(number, min(n_stopped, (number + 1) // 2))
             assert wait_for(lambda: is_idle(self.executor))
         self.pool.shutdown()
-        self.thread_pool.terminate()
         self.thread_pool.join()
         return self.watch.drift(self.executor.statistics())
 
