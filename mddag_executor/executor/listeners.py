@@ -78,8 +78,6 @@ _until_next_call.restype = ctypes.c_int
 
 # without errno and conversions of arguments: half the time, for each timer that is due
 _timer_settime = _quick.timerfd_settime
-_no_time = array('q', (0, 0, 0, 0))
-_NO_TIME = ctypes.c_void_p(_no_time.buffer_info()[0])
 
 
 class ListenerError(MddagError):
@@ -224,7 +222,7 @@ class TimerFd:
     :ivar at: that time, monotonic ns; NEVER: none is set.
     """
 
-    __slots__ = ('fd', 'at', '_time', '_set', '_unset')
+    __slots__ = ('fd', 'at', '_time', '_set')
 
     def __init__(self) -> None:
         self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
@@ -236,8 +234,6 @@ class TimerFd:
         # 1: TFD_TIMER_ABSTIME
         address = ctypes.c_void_p(self._time.buffer_info()[0])
         self._set: Callable[[], int] = partial(_timer_settime, self.fd, 1, address, None)
-        self._unset: Callable[[], int] = partial(
-            _timer_settime, self.fd, 1, _NO_TIME, None)
 
     def arm(self, at: int) -> None:
         """
@@ -247,9 +243,8 @@ class TimerFd:
         """
         self.at = at
         if at >= NEVER:
-            self._unset()
-            return
-        if at <= 0:  # the system call accepts no negative time, and 0 means that none is set
+            at = 0  # which means that no time is set
+        elif at <= 0:  # the system call accepts no negative time
             at = 1
         fields = self._time
         fields[2] = at // 1_000_000_000
@@ -261,7 +256,7 @@ class TimerFd:
         """Close the descriptor, once."""
         fd, self.fd = self.fd, -1
         if fd >= 0:
-            self._set = self._unset = _nothing  # another descriptor may get its number
+            self._set = _nothing  # another descriptor may get its number
             os.close(fd)
 
     def __del__(self) -> None:
