@@ -36,10 +36,10 @@ LATE_DEADLINES = 6
 A late queue is ordered as if it were released this many relative deadlines later.
 
 It is found late at the latest one deadline after its release, and its turn is at the latest one
-deadline after its new release: eight in all.  Up to one deadline may pass before that until the
-next release, and one is left for what runs already or has its turn as well.  So each callback
-starts once in ten of its relative deadlines, however long the overload lasts.  Less important work
-gives way to a late sink for this many.
+deadline after its new release: eight in all.  The release may be one deadline after the last
+start, and one deadline is left for what runs already or has its turn at the same time.  So each
+callback starts once in ten of its relative deadlines, however long the overload lasts.  Less
+important work gives way to a late sink for this many.
 """
 PPM = 1_000_000
 

@@ -377,10 +377,15 @@ class Engine:
         return bypass.is_open
 
     def _is_core_empty(self) -> bool:
-        """Return whether nothing is waiting, running on a worker or owning a group in the core."""
+        """
+        Return whether nothing in the core waits, runs on a worker, or owns a group.
+
+        An execution that has lent its worker may still have a place in its outer group.
+        """
         state = self._state
-        return not (has_waiting(self._state) or state.scalars[N_IDLE] < self.n_workers
-                    or max(state.group_owner, default=-1) >= 0)
+        return not (has_waiting(state) or state.scalars[N_IDLE] < self.n_workers
+                    or max(state.group_owner, default=-1) >= 0
+                    or max(state.outer_running, default=0) > 0)
 
     def _end_bypass(self) -> Scheduler:
         """End the bypass: report everything to the core; return the core."""

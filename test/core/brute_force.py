@@ -26,7 +26,7 @@ Its reading of the documents:
   the deadlines that this one can meet (``rad``, ``llf``). If the mean times of all vertices
   together need more than the workers, the executions before it in the queue take their time as
   well.  If no execution can be in time, the queue is ordered as if the job of its head were
-  released eight relative deadlines later, until one of its executions runs; so are the later
+  released six relative deadlines later, until one of its executions runs; so are the later
   vertices of that job, and those of a job whose execution is the one that runs.  Once a head was
   late, the queue has no later place than that until one of its executions runs, even if others can
   be in time.  A preempted execution is a queue by itself.
@@ -251,7 +251,7 @@ class BruteForce:
         return {sink for sink, start in self._starts(execution).items() if begin > start}
 
     def _late_priority(self, execution, in_queue):
-        """Return the priority eight deadlines after the execution or its queue was late first."""
+        """Return the priority six deadlines after the execution or its queue was late first."""
         job, key = execution.job, self._at(execution)
         since = [each for each in (job.demoted, self.demoted.get(key) if in_queue else None)
                  if each is not None] or [self._later(job)]
@@ -262,7 +262,7 @@ class BruteForce:
         return self._released_at(execution, min(since))
 
     def _aged_priority(self, execution):
-        """Return the priority eight deadlines after the head of the queue was late first."""
+        """Return the priority six deadlines after the head of the queue was late first."""
         since = self.demoted.setdefault(self._at(execution), self._later(execution.job))
         return self._released_at(execution, since)
 

@@ -894,6 +894,35 @@ def test_a_full_queue_drops_its_oldest_messages_without_the_core():
     assert (full.ready, full.ran, full.dropped, engine.undeclared) == (4, 2, 2, 6)
 
 
+@pytest.mark.parametrize(('depth', 'expected'), [(0, [1, 2]), (1, [2])])
+def test_no_message_bypasses_a_program_whose_callbacks_all_wait_for_responses(depth, expected):
+    """They have lent their workers, but count for how many of the program may run at a time."""
+    engine = new_engine(workers=3)
+    engine.allow_bypass()
+    outer = engine.outer.new()
+    engine.outer.open(outer, 2)
+    calling, entity, other = new_entity(), new_entity(depth=depth), new_entity()
+    calling.outer = entity.outer = outer
+    calling.wall_ns = entity.wall_ns = other.wall_ns = 0
+    lent = []
+    for now in range(2):
+        engine.ready(Work(calling, print), now)
+        lent.append(engine.step(0, now).work)
+        engine.lend(lent[-1])
+    for number in (1, 2):
+        engine.ready(Work(entity, print, (number,)), 3)
+        assert engine.step(0, 3).work is None
+    check(engine)
+    engine.finished(lent[0], 3, 4, 4, 0, -1)
+    engine.ready(Work(other, print, (3,)), 5)
+    started = []
+    while (work := engine.step(0, 6).work) is not None:
+        started.append(work.args[0])
+        engine.finished(work, 6, 6, 6, 0, 0)
+    assert started == [*expected, 3]
+    check(engine)
+
+
 @examples(300)
 @given(st.sampled_from(sorted(POLICIES)), st.booleans(), STEPS)
 def test_work_of_an_entity_starts_in_its_order_and_is_never_lost(policy, slow, steps):
