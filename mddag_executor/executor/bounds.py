@@ -43,12 +43,12 @@ again after this.
 
 QUIET_NS = 5_000_000
 """
-If no thread had nothing to run for this long, one that rests lets the next look follow a timer.
+If the last rest of a thread was longer ago, one that rests sets the next look after a timer.
 
-It comes ``NET_NS`` after the next timer or other appointment, for which a thread wakes up anyway.
-So the callback of that timer need not set it.  In a process with many callbacks, the look is put
-off by up to ``NET_NS`` instead, so that the next callback need not set it, unless it would not
-come within ``NET_NS`` less this.
+The look comes ``NET_NS`` after the next timer or other appointment, for which a thread wakes up
+anyway.  So the callback of the timer need not set the look.  In a process with many callbacks,
+the look is put off by up to ``NET_NS`` instead, for the same reason, unless it would not come
+within ``NET_NS`` less this.
 """
 
 LOOK_PART = 4

@@ -220,7 +220,8 @@ class DueTimes:
         first = self._agenda.next
         if first != self._timer.at:
             self._timer.arm(first)
-        # A parked thread would look, although one waits.  The next callback need not set the look.
+        # A parked thread would look in vain, as this one waits.  The look is not cancelled but
+        # put off, so that the next callback need not set it.
         watch = self._watch
         if now - self._rested_at > QUIET_NS:
             if watch.at < first + QUIET_NS and watch.at < NEVER:

@@ -129,8 +129,8 @@ class Work:
     :ivar starter: of a task: the execution on whose behalf it runs; None: none.
     :ivar worker: its current or last worker.
     :ivar ready_ns: when it became ready, on the trace's clock.
-    :ivar place_ns: when the dropped execution became ready of which it has the place, because the
-        queue was full (see ``bypass``); NEVER: it has its own place.
+    :ivar place_ns: if it has the place of an older execution, which was dropped because the queue
+        was full (see ``bypass``): when that one became ready; otherwise NEVER.
     :ivar due_ns: when its timer was due, on the trace's clock; 0: it is of no timer.
     :ivar n_resets: how many times its timer had been reset when it was due.
     :ivar was_reset: whether its timer was reset since it had been due before.

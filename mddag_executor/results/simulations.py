@@ -157,7 +157,7 @@ class SlackProcess(TypedDict):
     name: str
     """Name of the process."""
     workers: FewerResult | None
-    """How many workers are enough in it, with the numbers of the others; null as below."""
+    """How many are enough in it if the others have theirs; null if deadlines are missed."""
 
 
 class SlackResultRare(TypedDict, total=False):

@@ -174,6 +174,10 @@ client.completed = getattr(client, 'completed', 0) + 1
     Case('core_bypassed_while_it_has_others', [(
         'executor/engine.py', 'self._may_bypass and self._is_core_empty()', 'self._may_bypass')],
         of('test_engine.py', 'test_what_bypasses_the_core_runs_as_the_core_would_run_it')),
+    Case('core_bypassed_while_places_are_lent', [(
+        'executor/engine.py', 'max(state.outer_running, default=0) > 0', 'False')], of(
+        'test_engine.py', 'test_no_message_bypasses_a_program_whose_callbacks_all_wait_for_'
+        'responses[0-expected0]')),
     Case('exceptions_swallowed', [(
         'executor/executor.py', 'self._errors.append(error)', 'pass')], of(
         'test_spin.py', *(
