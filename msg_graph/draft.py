@@ -71,8 +71,8 @@ class DraftCallback:
     :ivar judged: of a sink: False if it has no deadline.
     :ivar driven_by: of a sync of different rates, the topic of ``started_by`` that drives it.
     :ivar why: of a proposed sync, a comment with the reason.
-    :ivar is_irregular: whether the times between its executions are irregular, or it is a service:
-        ``interval_ns`` is the least mean of several.
+    :ivar is_irregular: whether the times between its executions are irregular, or it is a service.
+        If they vary, ``interval_ns`` is the least mean of several.
     :ivar came_once: whether it ran only once in a long recording, as for a latched topic.
     :ivar stores: whether it seems to only store its message: it is short and publishes nothing.
     """
@@ -418,8 +418,8 @@ class _Writer:
         elif callback.is_irregular:
             yield self._proposal(
                 f'period: {_rounded(callback.interval_ns or 0)}', what,
-                'the least measured time between two of its executions, as a mean of several'
-                + ('' if is_service else ': they are irregular'))
+                'the usual measured time between two of its executions; if that varies, the least '
+                'mean of several')
             yield self._proposal(
                 'sporadic: true', 'whether it has no fixed rate',
                 'requests come when they are needed' if is_service else 'its rate is irregular')

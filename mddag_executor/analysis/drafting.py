@@ -28,11 +28,11 @@ Theory of operation
    the header stamps of several of their topics, or are as many as the messages of one of them.
 8. The period of a subscription or service comes from the times at which its messages or requests
    arrived (``usual_interval``), not from when it ran: executions of a busy pool come in bursts.
-   If the gaps are alike, the period is their median.  Otherwise it is that of the means of
+   If the gaps are alike, the period is their median.  Otherwise it is the median of the means of
    ``IN_A_ROW`` successive gaps, if these are alike: messages of two publishers, or of a network
    that delivers two at a time.  Otherwise it is the least of these means: a single gap may be
-   arbitrarily short, and a simulation releases a job in each period.  If there are fewer gaps,
-   that many would have taken longer than the recording.
+   arbitrarily short, and a simulation releases a job in each period.  With fewer gaps it is their
+   mean, but not so short that ``IN_A_ROW`` of them would fit into the recording.
    A source is ``sporadic`` if nothing is alike, if pauses take a good part of the time, or if it
    is a service.
 9. Execution times are the quantiles of ``PERCENT``. For a sync callback they are of the executions
@@ -587,7 +587,7 @@ def _runs_of(recording: Recording, which: Ints) -> Runs:
 
 def usual_interval(arrivals: Ints, end: int, steady: bool | None = None) -> tuple[int, bool]:
     """
-    Return the period of at least two arrivals, ns, and whether it is only the least one (rule 8).
+    Return the period of at least two arrivals, ns, and whether they are sporadic (rule 8).
 
     :param end: of the recording, ns.
     :param steady: whether the rate is known to be steady or not; None: it is found out.

@@ -27,7 +27,7 @@ def made_again(
     Yield each timer that was made again, and the first one of its kind.
 
     :param timers: in the order in which they were made.
-    :param last_starts: by number of a callback that ran the start of its last execution, ns.
+    :param last_starts: the start of the last execution of each callback that ran, by number, ns.
     :param end: of the recording, ns.
     """
     first: dict[tuple[str, int, str], Callback] = {}

@@ -253,7 +253,8 @@ class Entities:
         """
         Give the callbacks of timers, subscriptions and services unique labels.
 
-        :param first: by number of a timer that was made again: the first one, whose label it has.
+        :param first: of each timer that was made again, by number, the first one: it has the same
+            label.
         """
         used: dict[str, int] = {}
         for callback in sorted(self.names.callbacks, key=lambda c: (c.made, c.number)):
