@@ -43,7 +43,7 @@ again after this.
 
 QUIET_NS = 5_000_000
 """
-If the last rest of a thread was longer ago, one that rests sets the next look after a timer.
+If the last rest of a thread was longer ago, the next look is set by the next timer.
 
 The look comes ``NET_NS`` after the next timer or other appointment, for which a thread wakes up
 anyway.  So the callback of the timer need not set the look.  In a process with many callbacks,

@@ -157,7 +157,7 @@ class SlackProcess(TypedDict):
     name: str
     """Name of the process."""
     workers: FewerResult | None
-    """How many are enough in it if the others have theirs; null if deadlines are missed."""
+    """How many workers are enough in it, together with the other numbers; null if unknown."""
 
 
 class SlackResultRare(TypedDict, total=False):
