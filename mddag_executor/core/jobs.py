@@ -212,9 +212,14 @@ def give_up(t: Tables, s: State, slot: int, end: int, now: int) -> None:
 
 def judge_incomplete(
     t: Tables, s: State, slot: int, kind: int, after: int, until: int
-) -> None:
-    """Judge the incomplete sinks of an open job with deadlines after a time up to another one."""
+) -> int:
+    """
+    Judge the incomplete sinks of an open job with deadlines after a time up to another one.
+
+    :return: the number of judged ones.
+    """
     dag = s.job_dag[slot]
+    found = 0
     for i in range(t.first_sink[dag], t.first_sink[dag + 1]):
         vertex = t.sinks[i]
         deadline = s.job_release[slot] + t.sink_deadline[vertex]
@@ -222,6 +227,8 @@ def judge_incomplete(
                 s.x_pending[s.job_base[slot] + t.region_offset[vertex]] >= 0) and (
                 kind != SINK_OVERDUE or is_due(t, s, slot, vertex)):
             judge(t, s, slot, kind, vertex, deadline, -1)
+            found += t.judged[vertex]
+    return found
 
 
 def is_due(t: Tables, s: State, slot: int, vertex: int) -> bool:
@@ -237,7 +244,7 @@ def finish(t: Tables, s: State, now: int) -> None:
     for dag in range(t.n_dags):
         slot = s.oldest[dag]
         while slot >= 0:
-            judge_incomplete(t, s, slot, SINK_MISSED, -NEVER, now)
+            s.job_late[slot] += judge_incomplete(t, s, slot, SINK_MISSED, -NEVER, now)
             slot = s.job_next[slot]
 
 

@@ -7,10 +7,12 @@ import math
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor.core import quantile
+from mddag_executor.core import quantile, Scheduler, Tables
+from mddag_executor.core.state import JOB_END, LATE
 from mddag_executor.core.stops import KEEP_MISSES, KEEP_STOPS, Stops
 from mddag_executor.core.tally import SinkTally
 from mddag_executor.core.weakly_hard import MissWindow
+from msg_graph import loads
 
 from ..conftest import examples
 
@@ -123,3 +125,21 @@ def test_misses_long_over_are_forgotten():
         window.add(max(0, job - 100))   # late, and in no order
     assert window.worst == 2
     assert len(window._jobs) < 3 * (window.of + window.ORDER)
+
+
+def test_a_job_that_was_judged_at_the_end_of_the_run_has_ended_late():
+    """Its result had completed in time, but that was reported after the end."""
+    tables = Tables.build(loads("""
+mddag: 1
+nodes: [{node: /n, callbacks: [{name: tick, timer: 100ms, deadline: 50ms}]}]
+"""))
+    scheduler = Scheduler(tables, 1)
+    slot = scheduler.release(0, 0, 0, 0)
+    x = scheduler.source(slot)
+    scheduler.ready(x, 0)
+    assert scheduler.take(0, 0) == x
+    deadline = tables.sink_deadline[0]
+    scheduler.finish(deadline + 1)
+    scheduler.complete(x, deadline)
+    kind, *_, end, _ = scheduler.decisions()[-1]
+    assert (kind, end) == (JOB_END, LATE)
