@@ -16,6 +16,7 @@ import ctypes
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 import os
+from pathlib import Path
 import pkgutil
 import signal
 import time
@@ -105,5 +106,21 @@ def _answer(
 def signal_at_end_of(parent: int, which: signal.Signals) -> None:
     """Let the kernel send this process a signal when its parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, which)
-    if os.getppid() != parent:  # it has ended already
+    if has_ended(parent):
         os.kill(os.getpid(), which)
+
+
+def has_ended(parent: int) -> bool:
+    """
+    Return whether the parent of this process has ended, or is ending.
+
+    The signal comes when the thread that started this process has ended.  A parent that was killed
+    remains the parent until its other threads have ended as well.
+    """
+    if os.getppid() != parent:
+        return True
+    try:
+        state = Path('/proc', str(parent), 'stat').read_text().rpartition(')')[2].split()[0]
+    except OSError:     # it ended just now, or this machine does not show it
+        return os.getppid() != parent
+    return state in 'ZX'    # of its first thread

@@ -46,7 +46,7 @@ import threading
 import time
 from typing import Any, BinaryIO, TextIO
 
-from mddag_executor.child import signal_at_end_of
+from mddag_executor.child import has_ended, signal_at_end_of
 from mddag_executor.core.tally import of_processes
 from mddag_executor.errors import MddagError
 from mddag_executor.executor.entity import add_counts
@@ -292,9 +292,9 @@ class Part:
         try:
             _write(self.folder / f'{os.getpid()}.json', json.dumps(result, default=list))
         except FileNotFoundError:   # another process has removed it, if the run was killed
-            if os.getppid() == self.parent:
+            if not has_ended(self.parent):
                 raise
-        if os.getppid() != self.parent:     # nothing else can remove it; it may have died just now
+        if has_ended(self.parent):  # nothing else can remove the folder
             shutil.rmtree(self.folder, ignore_errors=True)
 
     @staticmethod

@@ -191,6 +191,35 @@ def test_a_child_does_not_outlive_who_started_it(tmp_path, code):
     assert wait_for(lambda: has_ended(int(mark.read_text())), 60.0)
 
 
+# Its first thread ends, as it does first in a process that was killed; the second one waits.
+PARENT_ENDS = """
+import ctypes, os, subprocess, sys, threading
+threading.Thread(target=lambda: sys.stdin.read()).start()
+subprocess.Popen([sys.executable, '-c', sys.argv[1], str(os.getpid())], stdin=subprocess.DEVNULL)
+ctypes.CDLL(None).syscall(60 if os.uname().machine == 'x86_64' else 93, 0)  # exit
+"""
+CHILD_SEES = """
+import os, signal, sys
+from mddag_executor.child import has_ended, signal_at_end_of
+parent = int(sys.argv[1])
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+signal_at_end_of(parent, signal.SIGTERM)
+signal.sigwait([signal.SIGTERM])
+print(os.getppid() == parent, has_ended(parent), flush=True)
+"""
+
+
+def test_a_killed_parent_has_ended_though_some_of_its_threads_have_not():
+    with subprocess.Popen(
+        [sys.executable, '-c', PARENT_ENDS, CHILD_SEES], stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE, text=True,
+    ) as parent:
+        try:
+            assert parent.stdout.readline() == 'True True\n'
+        finally:
+            parent.kill()
+
+
 # --- a session -----------------------------------------------------------------------------------
 
 
