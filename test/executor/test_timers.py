@@ -471,7 +471,8 @@ def test_a_message_from_before_the_spin_is_released_when_it_begins(
         assert wait_for(lambda: len(got) == 2)
     expected = got[1] if stamp == 'source_timestamp' else sent
     assert len(released.releases) == 2
-    assert abs(released.releases[1] - executor._trace_clock.of_system(expected)) < MS
+    # the pause took 100 ms; the system clock may be set by a few ms meanwhile
+    assert abs(released.releases[1] - executor._trace_clock.of_system(expected)) < 50 * MS
 
 
 def test_a_declared_subscription_of_clock_is_the_nodes_own(make_executor, make_node):
