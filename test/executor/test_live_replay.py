@@ -406,8 +406,9 @@ def test_the_cause_of_most_misses(tmp_path):
         for cause, told in zip(kinds, pool.map(found, kinds)):
             assert told.get(cause, 0) >= 5, cause
             assert all(n <= told[cause] for other, n in told.items() if other != 'machine'), told
-            # what a busy machine makes late besides has other causes as well
-            assert cause != 'machine' or [*told] == ['machine']
+            # what a busy machine makes late besides has other causes as well, and what came during
+            # a stop may be dropped before it runs
+            assert cause != 'machine' or {*told} <= {'machine', 'dropped'}
 
 
 def causes_in(trace, stops):
