@@ -19,11 +19,9 @@ def recorded_callbacks(recording: Recording) -> dict[str, RecordedCallback]:
     """Return by label counts and times (ns) of the recorded callbacks that ran."""
     start, end, piece = (recording.executions[name] for name in ('start', 'end', 'piece'))
     numbers, index = different(recording.executions['callback'])
-    labels, which = np.unique(np.array(
-        [recording.names.name(number) for number in numbers.tolist()], dtype=np.str_),
-        return_inverse=True)
+    labels, which = recording.labels(numbers)
     found: dict[str, RecordedCallback] = {}
-    for label, mine in zip(labels.tolist(), rows_by(which[index], len(labels))):
+    for label, mine in zip(labels, rows_by(which[index], len(labels))):
         ended = mine[end[mine] >= 0]
         took = end[ended] - start[ended]
         found[label] = {

@@ -31,7 +31,7 @@ FREE, OPEN, COMPLETED, LATE, ABORTED, EXPIRED, FAILED, OUTDATED = range(8)
 ELSEWHERE, HERE, LEADS_OUT = range(3)
 
 # What the end of an execution means for its vertex (``ending``).  NOTHING: the vertex has
-# completed, and nothing follows from that here; ENDS: it ends in the job (``jobs.end_in``);
+# completed, and nothing follows from that here; ENDS: it ends in the job (``rules._end_in``);
 # PARTS: there is more to find out (``rules._complete_part``).
 NOTHING, ENDS, PARTS = range(3)
 

@@ -236,6 +236,17 @@ class Recording:
         """Return the declared name of a callback, otherwise its node and trigger."""
         return self._keys.get(number) or self.names.name(number)
 
+    def labels(self, numbers: Ints) -> tuple[list[str], Ints]:
+        """
+        Return the names of callbacks, sorted, and by callback the place of its name.
+
+        A timer that was made again has the name of the first one.
+        """
+        names, places = np.unique(np.array(
+            [self.names.name(number) for number in numbers.tolist()], dtype=np.str_),
+            return_inverse=True)
+        return names.tolist(), places
+
     @cached_property
     def programs_of_executions(self) -> Ints:
         """Return by execution its program, if that runs one callback at a time; else -1."""

@@ -59,12 +59,9 @@ def executions(replay: Replay, rows: Ints | None = None) -> tuple[list[Column], 
     names = [vertex.name for vertex in recording.task_set.vertices]
     others, which = np.unique(table['callback'][~declared], return_inverse=True)
     vertex = table['vertex'].astype(np.int64)
-    # a timer that was made again has one name
-    labels, place = np.unique(np.array(
-        [recording.names.name(each) for each in others.tolist()], dtype=np.str_),
-        return_inverse=True)
+    labels, place = recording.labels(others)
     vertex[~declared] = len(names) + place[which]
-    names += labels.tolist()
+    names += labels
     start, end = table['start'], table['end']
     reference = release + np.array([*judged.tables.rad_offset[:-1], 0])[table['vertex']]
     first = table['piece'] == 0
