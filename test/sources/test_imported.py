@@ -418,8 +418,8 @@ def test_callbacks_are_summed_up_in_one_pass():
         np.arange(1_000) < 10, UNKNOWN, 1_000 + number))
     table = Table({name: table[name].view(Counted) for name in table.names})
     Counted.rows = 0
-    found = recorded_callbacks(SimpleNamespace(
-        executions=table, names=SimpleNamespace(name='c{:03}'.format)))
+    found = recorded_callbacks(SimpleNamespace(executions=table, labels=lambda numbers: (
+        [f'c{n:03}' for n in numbers.tolist()], np.arange(len(numbers)))))
     assert Counted.rows < 20 * len(table)
     assert list(found) == [f'c{n:03}' for n in range(200)]
     assert found['c007'] == {'executions': 4, 'unfinished': 1, 'busy_ns': 28, 'shortest_ns': 7,
