@@ -28,7 +28,7 @@ from mddag_executor.core.tables import NEVER, Tables
 
 def inherit(t: Tables, s: State, x: int, priority: int, like: int) -> None:
     """
-    Let a waiting undeclared execution inherit a priority, if its own one is not smaller.
+    Let a waiting undeclared execution inherit a priority, if that is smaller than its own one.
 
     :param like: the vertex of the execution that has sent the request, of which the priority is.
     """

@@ -142,6 +142,16 @@ def test_a_less_urgent_sender_changes_nothing():
     assert core.heritage(request) is None   # its own requests have the default deadline as well
 
 
+def test_a_sender_that_is_as_urgent_changes_nothing():
+    core = new_core()
+    for number, queue in enumerate((core.new_queue(), -1)):     # -1: it goes on
+        request = core.ready_undeclared(0, -1, 0, queue, number)
+        core.inherit(request, number + DEFAULT, 0)
+        assert core.take(0, number) == request
+        assert core.heritage(request) is None
+        core.complete(request, number)
+
+
 def test_requests_of_a_service_keep_their_order():
     """Those before an urgent one go before everything that is less urgent as well."""
     core = new_core()

@@ -203,6 +203,49 @@ def test_several_that_go_on_in_a_closed_group_do_so_one_after_the_other():
     assert core.take(0, 9) == fresh
 
 
+@pytest.mark.parametrize('seed', range(20))
+def test_those_that_wait_keep_their_order_when_one_goes_on_in_a_closed_group(seed):
+    """Each is set aside when it comes, whatever it inherits."""
+    draw = random.Random(seed)
+    core = Scheduler(Tables.build(
+        None, legs=True, default_deadline=1000, max_active_jobs=4, expire_after=1000), 2, 'rad')
+    outer = core.new_outer_group()
+
+    def ready(now):
+        x = core.ready_undeclared(0, -1, 0, core.new_queue(), now)
+        core.state.x_outer[x] = outer
+        return x
+
+    core.open_outer(outer, 1)
+    several = [ready(0), ready(0)]
+    for x in several:
+        assert core.take(0, 0) == x
+        core.lend(x)
+    core.open_outer(outer, 0)
+    core.rejoin(several[0], 0, 0, 1)
+    assert core.take(0, 1) == several[0]
+    waiting = {}
+    others = draw.sample(range(100, 900), 12)
+    place = draw.randrange(len(others))
+    for number, priority in enumerate(others):
+        if number == place:
+            core.rejoin(several[1], 0, 0, 2)
+            assert core.take(1, 2) == -1
+        x = ready(2)
+        core.inherit(x, priority, 0)
+        assert core.take(1, 2) == -1
+        waiting[priority] = x
+    core.complete(several[0], 3)
+    assert core.take(0, 3) == several[1]
+    core.complete(several[1], 4)
+    core.open_outer(outer, 1)
+    started = []
+    while (x := core.take(0, 5)) >= 0:
+        started.append(x)
+        core.complete(x, 5)
+    assert started == [waiting[priority] for priority in sorted(waiting)]
+
+
 def test_the_number_of_a_freed_outer_group_is_used_again_when_none_of_it_is_left():
     core = Scheduler(Tables.build(
         None, legs=True, default_deadline=100, max_active_jobs=4, expire_after=1000), 2, 'rad')

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mddag_executor.core import NEVER, Scheduler, Tables
 from mddag_executor.core.estimates import ADMIT_NS, Estimates
 from mddag_executor.core.jobs import is_miss
-from mddag_executor.core.overload import admit
+from mddag_executor.core.overload import admit, gives_way, note_late
 from mddag_executor.core.tables import importances
 from mddag_executor.core.tally import counts
 from mddag_executor.resources import find
@@ -174,6 +174,22 @@ def test_less_important_work_gives_way_to_a_late_important_sink():
         timer('second', 40, 20, 15, importance=importance)), 8000)['second']['in_time']
         for importance in ('low', 'high'))
     assert low == 0 and high >= 0.7 * 200  # the first has a turn in each eight of its deadlines
+
+
+def test_nothing_gives_way_to_a_late_sink_that_gives_way_itself():
+    """Neither does anything when the overload ends that it was late in."""
+    scheduler = live(case_of(
+        timer('low', 10, 10, 2, importance='low'), timer('normal', 10, 10, 6),
+        timer('high', 10, 10, 6, importance='high')).task_set, 1)
+    t, s = scheduler.tables, scheduler.state
+    admit(t, s)
+    assert [gives_way(t, s, vertex) for vertex in range(3)] == [True, True, False]
+    note_late(t, s, 1, 0)
+    s.mean[1] = TICK
+    admit(t, s)
+    assert not any(gives_way(t, s, vertex) for vertex in range(3))
+    note_late(t, s, 1, 0)   # now it is in its own right
+    assert [gives_way(t, s, vertex) for vertex in range(3)] == [True, False, False]
 
 
 def test_an_important_sink_shares_its_importance_with_what_it_reads():
