@@ -694,6 +694,90 @@ def test_what_is_taken_while_its_node_is_removed_counts_as_dropped():
     assert entity.dropped == len(recorded) == 1
 
 
+def test_what_the_end_of_a_context_has_kept_from_running_is_dropped():
+    """What has begun has run; neither keeps a worker."""
+    engine, entity = new_engine(workers=2), new_entity()
+    for has_run in (True, False):
+        work = Work(entity, print)
+        engine.ready(work, 0)
+        assert engine.step(0, 0).work is work
+        engine.left_open(work, 0, 5, 0, 0, has_run)
+        check(engine)
+    assert (entity.ready, entity.ran, entity.dropped, entity.busy_ns) == (2, 1, 1, 5)
+    assert entity.is_through() and engine.idle_workers == 2
+
+
+def test_a_message_that_its_group_has_refused_answers_the_job_that_is_the_newest_later():
+    task_set = loads(graph(
+        lidar='name: scan, timer: 50ms, publishes: [/points], dag: scan',
+        camera='name: grab, timer: 20ms, publishes: [/boxes], deadline: 20ms',
+        fusion='name: fuse, sync: {topics: [/boxes, /points], driven_by: /points}, '
+        'publishes: [/obstacles], deadline: 1s'))
+    engine = new_engine(task_set, 2)
+    scan = entity_of(engine, task_set, 0, 0)
+    points, boxes = (entity_of(engine, task_set, 0, 1) for _ in range(2))
+    for entity, topic in ((points, '/points'), (boxes, '/boxes')):
+        entity.topic, entity.awaiting = topic, engine.answers.awaiting['/fusion:fuse']
+    boxes.may_answer, boxes.targets = True, {}
+    fused = Work(boxes, print)
+    engine.ready(fused, 0)
+    assert engine.step(0, 0).work is fused and engine.origin_of(fused) is None
+    engine.refused(fused, MS)
+    check(engine)
+    engine.timer_due(Work(scan, print), MS, MS)
+    scanned = engine.step(0, MS).work
+    driving = Work(points, print)
+    engine.arrived(driving, scanned.origin, -1, -1, 2 * MS)
+    assert engine.step(1, 2 * MS).work is driving
+    engine.finished(scanned, MS, 2 * MS, 2 * MS, 0, 0)
+    assert engine.step(0, 2 * MS).work is fused
+    engine.answers.note_published(fused, '/obstacles', None)
+    for work in (driving, fused):
+        engine.finished(work, 2 * MS, 3 * MS, 3 * MS, 0, work.worker)
+        check(engine)
+    dag = engine.verdicts.tally.result()['dags']['scan']
+    assert counts(dag['sinks']['/fusion:fuse']).in_time == 1
+
+
+def test_jobs_are_judged_that_were_released_before_their_process_is_ready():
+    """Of several processes, the one that is ready last says since when."""
+    task_set = loads(GRAPH)
+    engine = new_engine(task_set, 2)
+    timer = entity_of(engine, task_set, 0, 0)
+    engine.set_judging(False, None, 0)
+    for since, release, now in ((0, MS, 2 * MS), (3 * MS, 4 * MS, 6 * MS)):
+        if since:
+            engine.set_judging(True, since, 5 * MS)
+        engine.timer_due(Work(timer, print), release, now)
+        work = engine.step(0, now).work
+        engine.finished(work, now, now, now, 0, 0)
+    dag = engine.verdicts.tally.result()['dags']['/n']
+    assert counts(dag['sinks']['/n:tick']).in_time == 1
+
+
+def test_how_long_something_has_waited_for_its_program_counts_from_the_first_time():
+    """Not from the last time that something more urgent of the program went before it."""
+    task_set = loads(GRAPH)
+    engine = new_engine(task_set, 2)
+    outer = engine.outer.new()
+    engine.outer.open(outer, 1)
+    first, patient, urgent = new_entity(), new_entity(), entity_of(engine, task_set, 0, 0)
+    for each in (first, patient, urgent):
+        each.outer = outer
+    works = [Work(first, print), Work(patient, print)]
+    for work in works:
+        engine.ready(work, 0)
+    assert engine.step(0, 0).work is works[0] and engine.step(1, MS).work is None
+    engine.finished(works[0], 0, 5 * MS, 5 * MS, 0, 0)
+    engine.timer_due(Work(urgent, print), 5 * MS, 5 * MS)
+    work = engine.step(0, 5 * MS).work
+    assert work.entity is urgent and engine.step(1, 6 * MS).work is None
+    engine.finished(work, 5 * MS, 9 * MS, 9 * MS, 0, 0)
+    assert engine.step(0, 9 * MS).work is works[1]
+    assert engine.outer.read_wait(outer) == 8 * MS
+    check(engine)
+
+
 def test_the_time_of_pauses_does_not_count_as_held():
     """Else an overtaken callback would soon seem to take longer than usual."""
     engine = new_engine(workers=2)
@@ -720,6 +804,20 @@ def test_how_long_a_timer_may_stay_unnoticed(make_executor, kind, deadline, part
         entity.callback, entity.source = None, -1
     entity.habit = GilHabit(kind != 'waits')
     assert pool_of(executor).due.allowance(entity, 10 * MS) == part * MS
+
+
+def test_half_a_deadline_is_left_when_a_message_of_a_job_arrives(make_executor):
+    """All of it if the job is released then, or if the message is of no job."""
+    task_set = loads(graph(
+        n='name: tick, timer: 80ms, publishes: [/a], dag: a',
+        m='name: use, subscription: /a, deadline: 80ms',
+        o='name: hear, subscription: /b, period: 80ms, deadline: 80ms',
+        p='name: hear, subscription: /b, period: 80ms, deadline: 80ms, '
+        'release_from: source_timestamp'))
+    engine = engine_of(make_executor(task_set, default_deadline='80ms'))
+    entities = [entity_of(engine, task_set, *place) for place in ((0, 1), (1, 0), (2, 0))]
+    found = [engine.relative_deadline(entity) for entity in (*entities, new_entity())]
+    assert found == [40 * MS, 80 * MS, 40 * MS, 80 * MS]
 
 
 class Appointment:

@@ -536,6 +536,32 @@ def test_publications_before_the_count_began_are_learnt():
     assert [bench.job(150, 103), bench.job(150, 1)] == [3, 4]
 
 
+def test_a_shift_of_known_numbers_is_learnt_of_four_messages_in_a_row():
+    """Two or three that differ alike may be of another publisher."""
+    bench = Bench((0, 10))
+    assert bench.job(5, 1) == 1
+    for job in range(2, 7):
+        bench.published(job, job * 100, job * 100 + 10)
+    assert [bench.job(job * 100 + 5, job + 7) for job in range(2, 6)] == [None, None, None, 5]
+    assert [bench.job(605, number) for number in (6, 13)] == [None, 6]
+
+
+def test_messages_that_come_after_that_of_their_publication_teach_nothing():
+    bench = Bench(*((job * 100, job * 100 + 10) for job in range(6)))
+    assert [bench.job(job * 100, job + 1) for job in range(6)] == [*range(1, 7)]
+    assert [bench.job(job * 100 + 5, job + 8) for job in range(6)] == 6 * [None]
+
+
+def test_numbers_are_known_as_well_of_a_message_that_fits_two_publications():
+    bench = Bench((0, 10), (5, 15, 1), (100, 110), (200, 210))
+    assert bench.job(7, 1) is None  # of which of both?
+    assert [bench.job(105, 2), bench.job(205, 3)] == [3, 4]
+    bench = Bench((0, 10), (5, 15, 1), (100, 110), (200, 210), (300, 310))
+    bench.publishers[1].numbers.confirm(1, 9)
+    assert bench.job(7, 1) == 1
+    assert [bench.job(105, 12), bench.job(205, 13), bench.job(205, 3)] == [None, None, 4]
+
+
 def test_messages_of_a_stranger_in_the_window_belong_to_no_job():
     """Whatever its numbers are, and however often they differ alike."""
     bench = Bench()
