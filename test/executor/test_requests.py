@@ -2,16 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A service or action is as urgent as the callback with a deadline that has sent the request."""
 
+import ctypes
 from functools import partial
 import threading
 import time
 from types import SimpleNamespace
 
 from mddag_executor.core import NEVER, Tables
-from mddag_executor.executor import compat
+from mddag_executor.executor import compat, request_ids
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.kinds import ListenerEntity
-from mddag_executor.executor.request_ids import sender_of
+from mddag_executor.executor.request_ids import id_of_client, sender_of
 from mddag_executor.executor.sent_requests import SentRequests
 from mddag_executor.sources.open import open_recording
 from mddag_executor.whatif.load import LoadBuilder
@@ -246,6 +247,43 @@ def test_a_request_that_cannot_be_sent_is_forgotten(send):
     with pytest.raises(InvalidHandle):
         send(requests, fails)
     assert requests.is_empty()
+
+
+def test_the_thread_that_sends_a_request_takes_it_before_it_goes_on():
+    """So it is known before something less urgent begins, and what it inherits is found then."""
+    requests, found = SentRequests(), []
+    requests.add_receiver('/ask', lambda: found.append(requests.of_request(b'client', 7, 0)))
+    requests.add_receiver('/other', lambda: found.append('other'))
+    assert requests.send(lambda: 7, b'client', '/ask', 'handle', (5, 0)) == 7
+    assert found == [(5, 0)]
+
+
+READER = bytes(15) + b'\4'
+WRITER = bytes(15) + b'\3'
+
+
+@pytest.mark.parametrize(('middleware', 'shown', 'memory', 'expected'), [
+    (b'rmw_fastrtps_cpp', READER, b'', READER),
+    (b'rmw_fastrtps_cpp', WRITER, b'head' + WRITER + READER, READER),
+    (b'rmw_cyclonedds_cpp', READER, b'', None),
+    (b'rmw_fastrtps_cpp', WRITER, b'head' + WRITER + WRITER, None),
+    (b'rmw_fastrtps_cpp', WRITER, b'head' + WRITER + b'other process' + READER[13:], None),
+    (b'rmw_fastrtps_cpp', WRITER, b'nothing', None)],
+    ids=['reader', 'writer', 'other_middleware', 'no_reader', 'other_participant', 'not_found'])
+def test_the_id_of_a_client_is_unknown_if_the_rest_in_memory_does_not_agree(
+        monkeypatch, middleware, shown, memory, expected):
+    """A wrong one would let an ordinary request inherit, or read what is no id."""
+    data = ctypes.create_string_buffer(memory.ljust(256, b'\xff'), 256)
+    client = request_ids._Client(middleware, ctypes.addressof(data), b'/ask')
+
+    def give_id(_, gid):
+        ctypes.memmove(ctypes.addressof(gid._obj) + request_ids._Gid.data.offset, shown, 16)
+        return 0
+
+    monkeypatch.setattr(request_ids, '_rmw_client', lambda _: ctypes.addressof(client))
+    monkeypatch.setattr(request_ids, '_id_of_writer', give_id)
+    found = id_of_client(SimpleNamespace(pointer=0))
+    assert found == (None if expected is None else (expected, '/ask'))
 
 
 def test_the_client_of_a_header_is_unknown_if_the_rest_in_memory_does_not_agree():
