@@ -205,8 +205,8 @@ def _send(
         running.publishes(publisher, state, msg)
     else:
         claim = None if work is None or work.starter is None else (
-            work.starter.claim(state.topic, msg))
-        if claim is not None and claim.pool is running.pool:
+            work.starter.claim(state.topic, msg, running.pool))
+        if claim is not None:
             running.publishes(publisher, state, msg, claim.work)
             return _send_counted(original, publisher, msg, state, engine, topic, claim.origin)
         running.publishes(publisher, state, msg)

@@ -70,10 +70,15 @@ class Starter:
         self._work = weakref.ref(work)
         self._pool = weakref.ref(pool)
 
-    def claim(self, topic: str, message: Any) -> Claim | None:
-        """Return the execution, which publishes a message; None: it has ended, or has no job."""
+    def claim(self, topic: str, message: Any, publishing: Any = None) -> Claim | None:
+        """
+        Return the execution, which publishes a message; None: it has ended, or has no job.
+
+        :param publishing: the pool that runs the callback or task which publishes; None: a thread
+            outside of all pools does.  An execution of another pool does not publish by it.
+        """
         work, pool = self._work(), self._pool()
-        if work is None or pool is None:
+        if work is None or pool is None or publishing not in (None, pool):
             return None
         engine = pool.engine
         with pool.lock:     # it does not end meanwhile

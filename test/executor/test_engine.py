@@ -740,7 +740,7 @@ def test_a_message_that_its_group_has_refused_answers_the_job_that_is_the_newest
 
 
 def test_jobs_are_judged_that_were_released_before_their_process_is_ready():
-    """Of several processes, the one that is ready last says since when."""
+    """The one of several processes that is ready last says since when."""
     task_set = loads(GRAPH)
     engine = new_engine(task_set, 2)
     timer = entity_of(engine, task_set, 0, 0)

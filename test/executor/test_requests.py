@@ -272,7 +272,7 @@ WRITER = bytes(15) + b'\3'
     ids=['reader', 'writer', 'other_middleware', 'no_reader', 'other_participant', 'not_found'])
 def test_the_id_of_a_client_is_unknown_if_the_rest_in_memory_does_not_agree(
         monkeypatch, middleware, shown, memory, expected):
-    """A wrong one would let an ordinary request inherit, or read what is no id."""
+    """A wrong one would let an ordinary request inherit."""
     data = ctypes.create_string_buffer(memory.ljust(256, b'\xff'), 256)
     client = request_ids._Client(middleware, ctypes.addressof(data), b'/ask')
 

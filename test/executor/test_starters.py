@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import is_idle, matched, Spinning, wait_for
 from .declared import graph
+from .inside import engine_of
 
 GRAPH = graph(
     detector='name: detect, subscription: /image, period: 20ms, sporadic: true, '
@@ -340,7 +341,31 @@ def test_what_is_published_otherwise_belongs_to_no_job_and_is_named(
         assert TOO_LATE[publish] in drift.text and 'are not due' in drift.text
     assert len(recorded.drift()) == 1
     err = capfd.readouterr().err
-    assert err.count('/detector published 1 message on /alarm in ') == 1
+    assert '/detector published 1 message on /alarm in ' in err
+    assert err.count('/detector published ') == 1
+
+
+def test_a_message_that_is_being_published_when_the_execution_ends_is_due(
+        make_executor, make_node, monkeypatch):
+    """The thread that publishes it was just interrupted."""
+    begins = threading.Semaphore(0)
+
+    def publish(each, message):
+        threading.Thread(target=each.alarm, args=(message,)).start()
+        assert begins.acquire(timeout=60.0)
+
+    each = Detector(make_executor, make_node, publish)
+    attribution = engine_of(each.executor).attribution
+    send = attribution.publish
+
+    def send_later(*args):
+        begins.release()
+        assert each.may_go_on.wait(60.0)
+        return send(*args)
+
+    monkeypatch.setattr(attribution, 'publish', send_later)
+    assert each.run() == []
+    assert counts(each.executor.statistics()['dags']) == (IMAGES // 2, IMAGES // 2, 0)
 
 
 def test_results_that_are_due_are_missed_which_is_no_warning(
@@ -460,6 +485,44 @@ def observed(watch, executor):
     """Return how many messages the line about messages from outside counts; None: no line."""
     return next((each.observed for each in watch.drift(executor.statistics())
                  if each.kind == 'published outside'), None)
+
+
+def test_a_task_of_another_executor_publishes_for_no_job_there(make_executor, make_node):
+    """Its jobs are others, though the callback that has started the task waits for it."""
+    node = make_node('detector')
+    publisher = node.create_publisher(Header, '/alarm', 10)
+    other = make_executor(loads(GRAPH), nodes=[node])
+    watch = Watch(other, loads(GRAPH))
+
+    def publish(each, message):
+        task = other.create_task(publisher.publish, message)
+        assert wait_for(task.done)
+
+    each = Detector(make_executor, make_node, publish)
+    with Spinning(other):
+        each.run()
+        assert observed(watch, other) == IMAGES // 2
+    assert counts(each.executor.statistics()['dags']) == (0, IMAGES, 0)
+
+
+def test_a_declared_callback_that_runs_for_no_job_is_not_named(make_executor, make_node):
+    """It publishes what it is declared to."""
+    task_set, heard = loads(GRAPH.replace(
+        'deadline: 60s', 'publishes: [/braked]') + graph(
+            lamp='name: show, subscription: /braked, deadline: 60s').partition('nodes:\n')[2]), []
+    brake, lamp = make_node('brake'), make_node('lamp')
+    publisher = brake.create_publisher(Header, '/braked', 10)
+    brake.create_subscription(Header, '/alarm', publisher.publish, 10)
+    lamp.create_subscription(Header, '/braked', heard.append, 10)
+    foreign = make_node('foreign').create_publisher(Header, '/alarm', 10)
+    executor = make_executor(task_set, nodes=[brake, lamp])
+    watch = Watch(executor, task_set)
+    with Spinning(executor):
+        matched(foreign, publisher)
+        foreign.publish(Header())
+        assert wait_for(lambda: heard)
+    assert executor.statistics()['callbacks']['/brake:stop']['unattributed'] == 1
+    assert observed(watch, executor) is None
 
 
 def test_messages_before_the_run_are_counted_and_no_warning(make_executor, make_node, capfd):
