@@ -4,6 +4,8 @@
 
 import threading
 from time import monotonic_ns
+from types import SimpleNamespace
+import weakref
 
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
@@ -13,12 +15,14 @@ from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
 from mddag_executor.executor import due as due_module
+from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.attribution import Origin
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.gil_check import CHECK_PART, GilCheck
+from mddag_executor.executor.holder_check import HolderCheck
 from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest
@@ -844,6 +848,28 @@ def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
             found.append((watch.at - begin) // MS)
         pool.running, pool.polling = False, 0
     assert found == [NEVER, 121, 120, NEVER, 170, 170, 150]
+
+
+def test_what_nothing_waits_for_any_more_is_not_checked_and_not_kept():
+    """Its message may be large."""
+    engine, agenda = new_engine(workers=2), Agenda()
+    pool = SimpleNamespace(
+        engine=engine, agenda=agenda, pauses=SimpleNamespace(is_watched=False))
+    check = HolderCheck(pool, 0, lambda at: None)
+    holder, other = Work(new_entity(holds=True), print), new_entity(holds=True)
+    engine.ready(holder, 0)
+    assert engine.step(0, 0).work is holder
+    engine.ready(Work(other, print), 0)
+    engine.step(1, 0)
+    check.begin_if_wanted(0)
+    assert agenda.next < NEVER
+    engine.remove(other, 1)
+    check.note(1)
+    assert agenda.next == NEVER
+    engine.finished(holder, 0, 1, 1, 0, 0)
+    kept = weakref.ref(holder)
+    del holder
+    assert kept() is None
 
 
 def test_no_thread_is_woken_for_a_busy_group_but_for_its_owner():

@@ -3,6 +3,7 @@
 """Callbacks that hold the GIL: one at a time, most urgent first, and never a deadlock."""
 
 from functools import partial
+import hashlib
 import os
 import random
 import sys
@@ -10,6 +11,7 @@ import threading
 import time
 from types import SimpleNamespace
 
+from mddag_executor.executor import lending as lending_module
 from mddag_executor.executor import pausing, publishing
 from mddag_executor.executor.compat import function_of_task
 from mddag_executor.executor.gil import GilHabit
@@ -76,6 +78,7 @@ def test_what_is_learnt_of_callbacks(make_executor, make_node):
     group = ReentrantCallbackGroup()
 
     def lends():
+        compute(6)
         with executor.lend():
             bell.wait(0.02)
         ran.append('d')
@@ -97,7 +100,7 @@ def test_what_is_learnt_of_callbacks(make_executor, make_node):
     sleeps, computes, empty, lent = engine_of(executor).scheduler.state.mean[:4]
     # without the time in which it paused for a more urgent one, and checked that
     assert sleeps >= 20 * MS and computes >= 10 * MS
-    assert empty < 20 * MS and lent < 20 * MS
+    assert empty < 20 * MS and 3 * MS < lent < 20 * MS
     # on a busy machine it is not known how much it would have computed without the others
     assert computing is None or computing > 0.5
     assert sleeping is None or sleeping < 0.5
@@ -279,6 +282,39 @@ def test_what_a_thread_asks_for_starts_though_a_callback_that_usually_computes_w
     assert waits[1]
 
 
+def test_what_has_come_meanwhile_is_known_before_the_next_one_is_chosen(
+        make_executor, make_node, monkeypatch):
+    """Though no thread waits for events, and messages of other processes are in their sockets."""
+    monkeypatch.setattr(publishing, 'replace_delivery', lambda *args: None)
+    ran, begun, go_on = [], [threading.Event() for _ in 'ab'], [threading.Event() for _ in 'ab']
+
+    def wait(number):
+        ran.append('ab'[number])
+        begun[number].set()
+        assert go_on[number].wait(15.0)
+        time.sleep(0.002)   # it is no short one
+
+    text = declare(*((name, f'subscription: /{name}, period: 1s, deadline: {deadline}')
+                     for name, deadline in zip('abcd', ('1s', '10s', '50s', '1s'))))
+    nodes = Declared(make_node, text, {
+        'a': partial(wait, 0), 'b': partial(wait, 1),
+        'c': lambda: ran.append('patient'), 'd': lambda: ran.append('urgent')})
+    other = make_node('publishes')
+    publishers = [other.create_publisher(Header, f'/{name}', 10) for name in 'abcd']
+    with Spinning(make_executor(loads(text), num_workers=1, nodes=nodes.nodes.values())):
+        matched(*publishers)
+        publishers[0].publish(Header())
+        assert begun[0].wait(15.0)
+        for publisher in publishers[1:3]:
+            publisher.publish(Header())
+        go_on[0].set()
+        assert begun[1].wait(15.0)
+        publishers[3].publish(Header())
+        go_on[1].set()
+        assert wait_for(lambda: len(ran) == 4)
+    assert ran == ['a', 'b', 'urgent', 'patient']
+
+
 def test_a_callback_that_waits_starts_at_once_while_another_one_computes(
         make_executor, make_node, monkeypatch):
     """A thread waits for its messages then, though nothing that comes is urgent."""
@@ -342,6 +378,30 @@ def test_a_callback_pauses_while_a_more_urgent_one_computes(computing):
     assert computing.order('urgent') == ['begins', 'urgent', 'ends']
     assert still and steps[0] > still[0]  # it went on then
     assert paused[0] == 0 and paused[-1] >= 20 * MS  # it does not count as holding the GIL
+
+
+@pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
+def test_a_callback_pauses_no_longer_when_the_more_urgent_one_waits_for_a_response(
+        computing, monkeypatch):
+    """At once: it does not have to find that out itself."""
+    monkeypatch.setattr(pausing, 'CHECK_S', 3600.0)
+    steps, has_gone_on = [0], []
+
+    def step():
+        steps[0] += 1
+        return 'urgent' in computing.ran
+
+    def urgent():
+        before, end = -1, time.monotonic() + 15.0
+        while before != steps[0] and time.monotonic() < end:    # until it pauses
+            before = steps[0]
+            compute(20)
+        with computing.executor.lend():
+            has_gone_on.append(wait_for(lambda: steps[0] > before))
+
+    computing.meanwhile, computing.urgent, computing.takes = step, urgent, 0
+    assert computing.order('urgent') == ['begins', 'urgent', 'ends']
+    assert has_gone_on == [True]
 
 
 @pytest.mark.parametrize('is_held_by', ['user', 'library'])
@@ -593,6 +653,73 @@ def test_a_callback_pauses_for_a_more_urgent_one_that_goes_on(make_executor, mak
         lending.go_on()
         assert wait_for(lambda: is_idle(lending.executor))
     assert still
+
+
+@pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
+def test_a_callback_that_goes_on_waits_until_the_less_urgent_one_pauses(
+        make_executor, make_node, monkeypatch):
+    """That one may be in C code, which computes without the GIL."""
+    monkeypatch.setattr(pausing, 'PAUSES_BY_S', 20.0)
+    lending = Lending(make_executor, make_node, 7, lends='1s', blocks='60s')
+    in_c, found, data = [], [], bytes(50_000_000)
+
+    def hash_data():
+        while not lending.leave.is_set():   # it pauses at the beginning of a line only
+            lending.last = (in_c.append(1), hashlib.sha256(data), in_c.clear())
+
+    def then():
+        found.append(in_c.copy())
+        lending.leave.set()
+
+    lending.compute, lending.then = hash_data, then
+    with Spinning(lending.executor):
+        lending.start('lends')
+        lending.start('blocks')
+        assert wait_for(lambda: in_c)
+        lending.bell.set()
+        assert wait_for(lambda: found and is_idle(lending.executor))
+    assert found == [[]]
+
+
+def test_a_callback_that_goes_on_at_once_wakes_no_other_thread(
+        make_executor, make_node, monkeypatch):
+    """Nothing else waits, so it gets its worker back itself."""
+    executor, wakes = make_executor(num_workers=2), []
+    pool = pool_of(executor)
+    wake = pool.loop.wake
+
+    def lends():
+        with executor.lend():
+            assert wait_for(lambda: pool.polling)
+            monkeypatch.setattr(pool.loop, 'wake', lambda: (wakes.append(1), wake()))
+        monkeypatch.setattr(pool.loop, 'wake', wake)
+
+    with Spinning(executor):
+        assert wait_for(executor.create_task(lends).done)
+    assert not wakes
+
+
+def test_a_callback_waits_for_its_worker_while_others_end(
+        make_executor, make_node, monkeypatch):
+    """Then they do not wait for it, even if each of them is found to wait."""
+    monkeypatch.setattr(lending_module, 'REJOIN_NS', MS)
+    lending = Lending(make_executor, make_node, 1, lends='50s', waits='40s')
+    pool, checks = pool_of(lending.executor), []
+
+    def all_wait(_):
+        checks.append(list(lending.ran))
+        if len(checks) < 20:
+            pool.last_end += 1
+        return True
+
+    monkeypatch.setattr(pool.lending, '_all_wait', all_wait)
+    with Spinning(lending.executor):
+        lending.start('lends')
+        lending.start('waits')
+        lending.bell.set()
+        assert wait_for(lambda: 'ends' in lending.ran)
+        lending.leave.set()
+    assert len(checks) > 20 and lending.ran == ['lends', 'waits', 'goes on', 'ends']
 
 
 @pytest.mark.parametrize('is_async', [False, True])

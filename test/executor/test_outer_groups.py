@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A host opens and closes the callbacks of a program, and limits how many run at a time."""
 
+from functools import partial
 import threading
+import time
 
 from mddag_executor.executor import lending
 import pytest
@@ -144,3 +146,38 @@ def test_a_callback_that_has_waited_does_not_overlap_with_one_of_its_program(
         end.set()
         assert wait_for(lambda: all(task.done() for task in tasks))
     assert ran == ['asks', 'other', 'ends', 'goes on']
+
+
+def test_those_that_have_waited_go_on_one_after_the_other_when_the_spin_ends(
+        make_executor, monkeypatch):
+    """Neither overlaps with the one that runs then, nor with the other."""
+    monkeypatch.setattr(lending, 'REJOIN_NS', 3600 * 10 ** 9)
+    executor, ran, answer, end = make_executor(num_workers=2), [], threading.Event(), []
+    pool = pool_of(executor)
+
+    def asks(number):
+        ran.append(f'{number} asks')
+        with executor.lend():
+            answer.wait(FAR_S)
+        ran.append(f'{number} goes on')
+        time.sleep(0.05)
+        ran.append(f'{number} ends')
+
+    def other():
+        ran.append('other')
+        end.append(wait_for(lambda: not pool.running))
+        time.sleep(0.05)
+        ran.append('ends')
+
+    group = executor.new_outer_group(is_single=True)
+    group.open(1)
+    with Spinning(executor):
+        for number, what in enumerate((partial(asks, 1), partial(asks, 2), other), 1):
+            executor.create_task_in(group.number, what)
+            assert wait_for(lambda number=number: len(ran) == number)
+        answer.set()
+        assert wait_for(lambda: len(pool.lending.rejoining) == 2)
+    assert end == [True]
+    assert ran[2:4] == ['other', 'ends'] and sorted(ran[4:]) == [
+        '1 ends', '1 goes on', '2 ends', '2 goes on']
+    assert [each[0] for each in ran[4:]] in (['1', '1', '2', '2'], ['2', '2', '1', '1'])
