@@ -27,7 +27,6 @@ from time import monotonic_ns
 from typing import Any, Protocol
 
 from mddag_executor.executor.bounds import ALONE_NS, MOST, REJOIN_NS
-from mddag_executor.executor.due import DueTimes
 from mddag_executor.executor.engine import Engine, Step
 from mddag_executor.executor.gil_check import GilCheck
 from mddag_executor.executor.hall import Spinner
@@ -40,7 +39,6 @@ class Pool(Protocol):
     """The worker pool, as lending sees it: see ``workers.WorkerPool``."""
 
     engine: Engine
-    due: DueTimes
     pauses: Pauses
     lock: Any
     running: bool
@@ -184,7 +182,6 @@ class Lending:
         if step.overtaken:
             pool.pauses.begin(step.overtaken, thread)
         thread.permit.release()
-        pool.due.check.begin_if_wanted(pool.now - pool.offset)
 
     def is_back(self, thread: WorkerThread) -> None:
         """Note that a thread has a worker again, or its callback has ended; needs the lock."""

@@ -371,7 +371,7 @@ class TimerQueue:
 
     def _fire_again(self, source: TimerEntity) -> None:
         """Continue with a timer without a period, as its execution has started."""
-        if id(source) in self._timers and not source.entry:
+        if id(source) in self._timers:
             self._push(source, _now() + ZERO_PERIOD_NS)
 
     def _failed(self, source: TimerEntity, error: Exception) -> None:

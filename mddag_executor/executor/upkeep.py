@@ -60,8 +60,6 @@ class Upkeep:
         self._refresh_at = 0.0
         # entities without listener which the next refresh may find again
         self._silent: list[Kind] = []
-        # whether executions were left for entities that listen already (``transfers``)
-        self._has_left = False
 
     def change(self) -> None:
         """Note that entities may have been created or destroyed."""
@@ -116,10 +114,8 @@ class Upkeep:
             self._run_left(entity)  # first: later messages come after them
             self._listen(entity)
         self._apply()
-        if self._has_left:
-            self._has_left = False
-            for entity in list(registry.by_id.values()):
-                self._run_left(entity)
+        for entity in list(registry.by_id.values()):
+            self._run_left(entity)
         with pool.lock:
             pool.due.arm_for_new(time.monotonic_ns())
             if moved:
@@ -152,7 +148,6 @@ class Upkeep:
 
     def note_left(self) -> None:
         """Note that executions were left for one of its objects; from any thread."""
-        self._has_left = True
         self.change()
         self._rooms.at_once.ring()
 

@@ -711,7 +711,7 @@ class WorkerPool:
         elif self.polling:
             if self.engine.may_start_more(now):
                 self.call()
-            elif self.agenda.next < self._timer.at:
+            elif self.agenda.next < self._timer.at or self._interpreter.is_wanted():
                 due.arm(now - self.offset)
         elif step.n_idle:
             if me.is_spare or self._eager or self.engine.may_start_more(now):

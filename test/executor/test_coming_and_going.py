@@ -280,17 +280,39 @@ def test_names_of_destroyed_callbacks_are_kept_up_to_a_bound(
     """A helper node with a random name, for instance, that each request makes."""
     monkeypatch.setattr('mddag_executor.executor.registry.REMEMBERED', 2)
     executor, ran = make_executor(), []
-    for number in range(5):
+    for number in (*range(5), 0):
         node = make_node(f'helper_{number}')
+        before = ran.count(number)
         timer = node.create_timer(0.001, lambda number=number: ran.append(number))
         executor.add_node(node)
-        assert wait_for(lambda number=number: executor.spin_once(1.0) or number in ran)
+        assert wait_for(
+            lambda n=number, m=before: executor.spin_once(1.0) or ran.count(n) > m)
         node.destroy_timer(timer)
         executor.remove_node(node)
         executor.spin_once(0)
     counts = executor.statistics()['callbacks']
     assert sum(each['ran'] for each in counts.values()) == len(ran) >= 5
     assert len(counts) == 3 and counts[OTHERS]['ran'] >= 3
+    # the name of the first one is among those that are kept
+    assert ran.count(0) in [each['ran'] for name, each in counts.items() if '/helper_0' in name]
+
+
+def test_nodes_that_are_removed_and_come_back_without_a_spin_leave_no_descriptors(
+        make_executor, make_node):
+    """Also if several are, one after the other: each listens once again."""
+    nodes, ran = [make_node(name) for name in 'ab'], []
+    for node in nodes:
+        node.create_timer(0.001, lambda node=node: ran.append(node))
+        node.create_subscription(Header, '/a', print, 10)
+    executor, sizes = make_executor(nodes=nodes), []
+    for _ in range(6):
+        ran.clear()
+        assert wait_for(lambda: executor.spin_once(1.0) or len({*ran}) == 2)
+        sizes.append(len(os.listdir('/proc/self/fd')))
+        for change in (executor.remove_node, executor.add_node):
+            for node in nodes:
+                change(node)
+    assert sizes[-1] == sizes[1]
 
 
 def test_a_destroyed_node_is_freed_without_the_collector(make_executor, ros_context):

@@ -23,6 +23,7 @@ from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.gil_check import CHECK_PART, GilCheck
 from mddag_executor.executor.holder_check import HolderCheck
+from mddag_executor.executor.threads import WorkerThread
 from mddag_executor.executor.work import Work
 from msg_graph import loads
 import pytest
@@ -870,6 +871,21 @@ def test_what_nothing_waits_for_any_more_is_not_checked_and_not_kept():
     kept = weakref.ref(holder)
     del holder
     assert kept() is None
+
+
+@pytest.mark.parametrize('wall_ms', [0, 100])
+def test_what_takes_the_interpreter_is_checked_if_something_waits_for_it(make_executor, wall_ms):
+    """Though another thread waits for events already: it may sleep for long."""
+    pool = pool_of(make_executor(num_workers=3))
+    me, entities = WorkerThread(pool, None), [new_entity(holds=True) for _ in range(2)]
+    with pool.lock:
+        pool.running, pool.polling = True, 1
+        for entity in entities:
+            entity.wall_ns = wall_ms * MS
+            pool.engine.ready(Work(entity, print), pool.tick())
+        assert pool._choose(me, pool.now) and me.work.entity is entities[0]
+        assert pool.loop.timer.at <= pool.agenda.next < NEVER
+        pool.running, pool.polling = False, 0
 
 
 def test_no_thread_is_woken_for_a_busy_group_but_for_its_owner():

@@ -292,7 +292,7 @@ def test_what_has_come_meanwhile_is_known_before_the_next_one_is_chosen(
         ran.append('ab'[number])
         begun[number].set()
         assert go_on[number].wait(15.0)
-        time.sleep(0.002)   # it is no short one
+        time.sleep(0.002)   # so it is not short
 
     text = declare(*((name, f'subscription: /{name}, period: 1s, deadline: {deadline}')
                      for name, deadline in zip('abcd', ('1s', '10s', '50s', '1s'))))

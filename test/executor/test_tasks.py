@@ -194,6 +194,22 @@ def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor,
     assert task.done() and task.result() == 'done' and turns == [0, 1, 2, 3, 4]
 
 
+def test_a_coroutine_that_only_asks_again_and_again_takes_little_of_the_cpu(make_executor):
+    """It rests for a microsecond more each time."""
+    executor, turns = make_executor(), []
+
+    async def work():
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            await Turn()
+            turns.append(1)
+
+    with Spinning(executor):
+        assert wait_for(executor.create_task(work).done)
+    # this many microseconds have passed, whatever else the machine has done
+    assert len(turns) * (len(turns) - 1) // 2 <= 500_000
+
+
 def fails():
     raise KeyError('handled')
 

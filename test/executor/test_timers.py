@@ -16,12 +16,13 @@ from mddag_executor.core import NEVER
 from mddag_executor.executor import due
 from mddag_executor.executor.agenda import Agenda, CLEAN_EVERY
 from mddag_executor.executor.listeners import TimerFd
-from mddag_executor.executor.timers import TimerEntity
+from mddag_executor.executor.timers import TimerEntity, TimerQueue
 from mddag_executor.report.live_runs import live_lines
 from msg_graph import loads
 import pytest
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -33,6 +34,7 @@ from .declared import graph
 from .inside import at_once_of, engine_of, pool_of, registry_of
 
 MS = 1_000_000
+RCLError = rclpy_implementation.RCLError
 
 
 def waits_for_no_timer(executor):
@@ -250,6 +252,45 @@ def test_a_timer_that_left_while_its_arrival_was_handled_is_not_asked_again(
         each.collect()
     assert place.agenda.next == NEVER
     del kept
+
+
+def test_a_timer_without_a_period_that_has_left_is_not_asked_again(make_executor, make_node):
+    """Though an execution of it still starts."""
+    node = make_node()
+    node.create_timer(0.0, print)
+    executor = make_executor(nodes=[node])
+    executor._upkeep.refresh()
+    pool = pool_of(executor)
+    (source,) = pool.timers._timers.values()
+    for _ in range(2):
+        assert source.entry
+        assert wait_for(lambda: pool.agenda.next <= time.monotonic_ns())
+        with pool.lock:
+            pool.agenda.handle(time.monotonic_ns)
+    assert source.waiting and not source.entry
+    executor.remove_node(node)
+    with pool.lock:
+        assert pool.engine.step(0, pool.tick()).work.entity is source
+    assert not source.entry
+
+
+def test_an_error_of_rcl_ends_the_spin_unless_its_timer_is_cancelled(
+        make_executor, make_node, monkeypatch):
+    def fails(queue, source):
+        if source.rclpy_object is cancelled:
+            cancelled.cancel()
+        failed.append(source)
+        raise RCLError('it fails')
+
+    monkeypatch.setattr(TimerQueue, '_fire', fails)
+    node, failed = make_node(), []
+    cancelled = node.create_timer(0.001, print)
+    with Spinning(make_executor(nodes=[node]), raises=RCLError) as spinning:
+        assert wait_for(lambda: failed)
+        assert not wait_for(lambda: spinning.error, 0.05)
+        node.create_timer(0.001, print)
+        spinning.join()
+    assert len(failed) == 2
 
 
 @pytest.mark.parametrize(
