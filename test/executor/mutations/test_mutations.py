@@ -420,6 +420,83 @@ awaiting.named(
         'executor/publishing.py', "with running.lend(f'service {service_name(self)}'):",
         'if True:')], of(
         'test_bounds.py', 'test_blocked_calls_take_a_bounded_number_of_threads')),
+    # --- lending.py, holder_check.py
+    Case('what_goes_on_at_once_wakes_another_thread', [(
+        'executor/lending.py', 'if is_first:', 'if False:')], of(
+        'test_gil.py', 'test_a_callback_that_goes_on_at_once_wakes_no_other_thread')),
+    Case('one_check_decides_who_goes_on_without_a_worker', [(
+        'executor/lending.py', 'seen == (before[0], True)', 'seen[1]')], of(
+        'test_gil.py', 'test_a_callback_waits_for_its_worker_while_others_end')),
+    Case('who_goes_on_does_not_wait_for_the_pause', [(
+        'executor/lending.py', '        me.wait_for_pause()', '        pass')], of(
+        'test_gil.py', 'test_a_callback_that_goes_on_waits_until_the_less_urgent_one_pauses')),
+    Case('the_time_without_a_worker_counts_as_computing', [(
+        'executor/lending.py', 'measurement.pause()', 'pass')], of(
+        'test_gil.py', 'test_what_is_learnt_of_callbacks')),
+    Case('all_of_a_program_go_on_when_the_spin_ends', [(
+        'executor/lending.py', """\
+if not self._pool.engine.waits_for_place(work):
+                self._go_on_without(work)""", 'self._go_on_without(work)')], of(
+        'test_outer_groups.py',
+        'test_those_that_have_waited_go_on_one_after_the_other_when_the_spin_ends')),
+    Case('what_takes_the_interpreter_is_checked_at_the_next_event', [(
+        'executor/workers.py', ' or self._interpreter.is_wanted():', ':')], of(
+        'test_engine.py', *(
+            f'test_what_takes_the_interpreter_is_checked_if_something_waits_for_it[{wall_ms}]'
+            for wall_ms in (0, 100))), every=True),
+    Case('what_was_checked_is_kept', [(
+        'executor/holder_check.py', """\
+self._check.end()
+            self._cancel()""", 'self._cancel()')], of(
+        'test_engine.py', 'test_what_nothing_waits_for_any_more_is_not_checked_and_not_kept')),
+    Case('what_has_come_meanwhile_is_found_after_the_next_one', [(
+        'executor/workers.py',
+        'if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:',
+        'if False:')], of(
+        'test_gil.py', 'test_what_has_come_meanwhile_is_known_before_the_next_one_is_chosen')),
+    # --- attribution.py, sent_requests.py, request_ids.py
+    Case('two_messages_change_known_numbers', [(
+        'executor/attribution.py', '(2 if self._found == NO_NUMBER else MANY_UNLIKE)', '2')], of(
+        'test_other_processes.py',
+        'test_a_shift_of_known_numbers_is_learnt_of_four_messages_in_a_row')),
+    Case('late_messages_change_numbers', [(
+        'executor/attribution.py', 'if count <= self._found:', 'if False:')], of(
+        'test_other_processes.py',
+        'test_messages_that_come_after_that_of_their_publication_teach_nothing')),
+    Case('requests_are_taken_later', [(
+        'executor/sent_requests.py', 'self._receive(service)', 'pass')], of(
+        'test_requests.py',
+        'test_the_thread_that_sends_a_request_takes_it_before_it_goes_on')),
+    Case('ids_of_any_middleware_are_read', [(
+        'executor/request_ids.py', "if not client.implementation.startswith(b'rmw_fastrtps'):",
+        'if False:')], of(
+        'test_requests.py', 'test_the_id_of_a_client_is_unknown_if_the_rest_in_memory_does_not_'
+        'agree[other_middleware]')),
+    # --- starters.py, outside.py
+    Case('what_is_being_published_is_not_due', [(
+        'executor/starters.py', 'engine.attribution.note_optional(topic, origin)', 'pass')], of(
+        'test_starters.py',
+        'test_a_message_that_is_being_published_when_the_execution_ends_is_due')),
+    Case('tasks_of_other_executors_publish_for_jobs', [(
+        'executor/starters.py', ' or publishing not in (None, pool)', '')], of(
+        'test_starters.py', 'test_a_task_of_another_executor_publishes_for_no_job_there')),
+    Case('messages_from_outside_are_logged_again_and_again', [(
+        'executor/outside.py', 'self._has_warned.add(key)', 'pass')], of(
+        'test_starters.py', 'test_what_is_published_otherwise_belongs_to_no_job_and_is_named'
+        '[a_thread_that_goes_on]')),
+    # --- queues.py, overload.py, rules.py
+    Case('what_waits_for_a_closed_group_loses_its_order', [(
+        'core/queues.py', 'del heap[kept:]\n    heapify(heap)', 'del heap[kept:]')], of(
+        'core/test_outer_groups.py', *(
+            'test_those_that_wait_keep_their_order_when_one_goes_on_in_a_closed_group'
+            f'[{seed}]' for seed in range(20)))),
+    Case('waiting_for_a_program_counts_from_the_last_time', [(
+        'core/rules.py', 'if s.x_aside[x] < 0 and ', 'if ')], of(
+        'test_engine.py',
+        'test_how_long_something_has_waited_for_its_program_counts_from_the_first_time')),
+    Case('less_important_work_gives_way_to_what_gives_way', [(
+        'core/overload.py', ' or gives_way(t, s, sink):', ':')], of(
+        'core/test_overload.py', 'test_nothing_gives_way_to_a_late_sink_that_gives_way_itself')),
     Case('triggers_are_not_announced', [(
         'executor/publishing.py', 'announce_trigger(self.pointer)', 'pass')], of(
         'test_executor.py', 'test_each_of_many_runs_once[spin-of_guards]')),
