@@ -17,6 +17,7 @@ from mddag_executor.errors import UsageError
 from mddag_executor.executor import due as due_module
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.attribution import Origin
+from mddag_executor.executor.bounds import PATIENCE_NS
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
@@ -24,7 +25,7 @@ from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.gil_check import CHECK_PART, GilCheck
 from mddag_executor.executor.holder_check import HolderCheck
 from mddag_executor.executor.threads import WorkerThread
-from mddag_executor.executor.work import Work
+from mddag_executor.executor.work import current, Work
 from msg_graph import loads
 import pytest
 
@@ -886,6 +887,55 @@ def test_what_takes_the_interpreter_is_checked_if_something_waits_for_it(make_ex
         assert pool._choose(me, pool.now) and me.work.entity is entities[0]
         assert pool.loop.timer.at <= pool.agenda.next < NEVER
         pool.running, pool.polling = False, 0
+
+
+def test_what_computes_is_checked_when_something_comes_that_waits_for_it(make_executor):
+    """Else nothing would wake the thread that waits for events."""
+    pool = pool_of(make_executor(num_workers=3))
+    me, entities = WorkerThread(pool, None), [new_entity(holds=True) for _ in range(2)]
+    with pool.lock:
+        pool.running, pool.polling = True, 1
+        pool.engine.ready(Work(entities[0], print), pool.tick())
+        assert pool._choose(me, pool.now) and pool.agenda.next == NEVER
+        pool.engine.ready(Work(entities[1], print), pool.tick())
+        pool.wake_for(pool.now)
+        assert pool.loop.timer.at <= pool.agenda.next < NEVER
+        pool.running, pool.polling = False, 0
+
+
+def test_a_parked_thread_looks_soon_for_what_comes_during_a_short_callback(
+        make_executor, monkeypatch):
+    """In case that the callback takes longer this time."""
+    pool = pool_of(make_executor(num_workers=2))
+    me, entities = WorkerThread(pool, None), [new_entity(), new_entity()]
+    monkeypatch.setattr(current, 'running', me)
+    with pool.lock:
+        pool.running = True
+        entities[0].wall_ns = 0
+        pool.engine.ready(Work(entities[0], print), pool.tick())
+        assert pool._choose(me, pool.now)
+        pool.engine.ready(Work(entities[1], print), pool.tick())
+        pool.wake_for_more()
+        assert pool.parking.watch.at <= pool.now - pool.offset + PATIENCE_NS
+        pool.running = False
+
+
+def test_one_thread_is_called_until_it_has_looked(make_executor, monkeypatch):
+    """Each further one would find nothing more to start."""
+    pool, calls = pool_of(make_executor()), []
+    monkeypatch.setattr(pool.parking, 'call', lambda: calls.append(1))
+    monkeypatch.setattr(pool.loop, 'poll', lambda: [])
+    me = WorkerThread(pool, None)
+    pool._n_parked = 2
+    with pool.lock:
+        pool.call()
+        pool.call()
+    assert len(calls) == 1
+    pool._receive(me, None)
+    with pool.lock:
+        pool.call()
+    assert len(calls) == 2
+    pool._n_parked = 0
 
 
 def test_no_thread_is_woken_for_a_busy_group_but_for_its_owner():
