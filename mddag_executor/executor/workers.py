@@ -92,7 +92,8 @@ class WorkerPool:
     :param fail: receives every exception that a callback raises.
     :param prepare_thread: called first in each worker thread (priority, CPU set).
     :ivar running: whether executions may start.
-    :ivar stopped_at: when ``running`` became false, on the trace's clock; 0: it is true.
+    :ivar stopped_at: when the last spin stopped starting executions, on the trace's clock; 0:
+        ``spin_once`` has started some since.
     :ivar is_current: whether the registry knows all entities.
     :ivar now: the time of the last event, on the trace's clock.
     :ivar announcements: of other processes; None: there are none.
@@ -317,7 +318,6 @@ class WorkerPool:
                 return
             self.running = True
             self.is_spin_once = False
-            self.stopped_at = 0
             self.due.begin(self.tick() - self.offset)
             self.engine.machine_stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:

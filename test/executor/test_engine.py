@@ -920,6 +920,32 @@ def test_a_parked_thread_looks_soon_for_what_comes_during_a_short_callback(
         pool.running = False
 
 
+class Eager(Entity):
+    """An entity for which a thread has to wait, also while a callback computes."""
+
+    def may_come_from_outside(self):
+        return True
+
+    def is_eager(self):
+        return True
+
+
+def test_no_thread_waits_for_events_of_a_callback_that_has_gone(make_executor):
+    """While another one computes."""
+    pool = pool_of(make_executor(num_workers=2))
+    me, other = WorkerThread(pool, None), WorkerThread(pool, threading.current_thread())
+    eager = new_entity(kind=Eager)
+    with pool.lock:
+        pool.running = True
+        pool.engine.ready(Work(new_entity(holds=True), print), pool.tick())
+        assert pool._choose(me, pool.now)
+        for change, state in ((pool.note_eager, 'waiting'), (pool.forget_eager, 'parked')):
+            change(eager)
+            pool._rest(other, pool.now)
+            assert other.state.value == state
+        pool.running = False
+
+
 def test_one_thread_is_called_until_it_has_looked(make_executor, monkeypatch):
     """Each further one would find nothing more to start."""
     pool, calls = pool_of(make_executor()), []

@@ -307,6 +307,25 @@ def test_a_stamp_that_is_some_seconds_old_counts_and_is_named():
     assert "declare 'release_from: arrival'" in line and not releases.is_other
 
 
+def test_steps_after_a_spin_belong_to_the_run(make_executor, make_node, tmp_path):
+    """Nothing that they leave open is judged earlier than it ended."""
+    path, ran, node = tmp_path / 'live.mcap', [], make_node()
+    node.create_timer(0.01, lambda: ran.append(1))
+    executor = make_executor(loads(graph(
+        node='name: tick, timer: 10ms, publishes: [/a], dag: a',
+        none='name: hear, subscription: /a, deadline: 1ms')), nodes=[node], trace=str(path))
+    for step in (lambda: executor.spin_until_future_complete(Future(), 0.05), executor.spin_once):
+        before = len(ran)
+        assert wait_for(lambda n=before, step=step: step() or len(ran) > n + 4)
+    executor.shutdown()
+    live = executor.statistics()['dags']
+    assert total(live).missed >= 8
+    result = replay(path).result()['dags']
+    for sink in result['a']['sinks'].values():
+        del sink['breakdown'], sink['slack_ns']
+    assert result == live
+
+
 def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):
     text = graph(
         a="""
