@@ -981,7 +981,7 @@ class Engine:
             min(now, self._ended), self._state.scalars[JUDGE_FROM])
 
     def machine_stopped(self, begin: int, end: int) -> None:
-        """Note that the machine stood still; with equal times: that it has not so far."""
+        """Note that the machine stood still."""
         self.verdicts.machine_stopped(begin, end)
 
     def clock_was_set(self, step: int, now: int) -> None:

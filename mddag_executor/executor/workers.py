@@ -319,7 +319,6 @@ class WorkerPool:
             self.running = True
             self.is_spin_once = False
             self.due.begin(self.tick() - self.offset)
-            self.engine.machine_stopped(self.now, self.now)  # stops are noticed from now on
             while len(self._threads) < self.engine.n_workers:
                 self._new_thread()
             # one that did not leave after the last spin (``pause``) is asleep, and not parked

@@ -34,7 +34,6 @@ class Run:
     :ivar judge_from: the first judged release, ns; -NEVER: all are judged.
     :ivar judged_releases: range of judged releases, ns; None: all.
     :ivar hosted: changes of the vertices of a DAG that the process runs, by position in the order.
-    :ivar notices_stops: from this time on stops are recorded, ns; None: they are not.
     :ivar processes: number of processes; ``workers_each``: their largest number of workers.
     :ivar placed: nodes of each process; empty: one process.
     :ivar links: whether ``message`` is the publication that started an execution; otherwise the
@@ -62,7 +61,6 @@ class Run:
     judge_from: int = -NEVER
     judged_releases: tuple[int, int] | None = None
     hosted: Sequence[tuple[int, int, frozenset[int]]] = ()
-    notices_stops: int | None = None
     processes: int = 1
     workers_each: int = 0
     placed: Sequence[Process] = ()

@@ -146,9 +146,6 @@ class _Part:
                 for column in columns:
                     times = tables[name][column]
                     times[times > 0] += self.shift
-            run = self.found.run
-            if run.notices_stops is not None:
-                self.found.run = replace(run, notices_stops=run.notices_stops + self.shift)
         self.last = max(self.first, int(self.seen_at.max(initial=0)), *(
             int(tables[name][column].max(initial=0))
             for name, column in _HAPPENED.items()))
@@ -388,9 +385,7 @@ class Joined:
         # a process may end before the others
         waited = (executions['end'] < 0) & (executions['worker'] < 0)
         executions['start'][waited] = executions['began'][waited] = run.end
-        return replace(run, notices_stops=min(
-            (part.found.run.notices_stops for part in self._parts
-             if part.found.run.notices_stops is not None), default=None))
+        return run
 
     # --- jobs ------------------------------------------------------------------------------------
 

@@ -281,13 +281,13 @@ class _Source:
         losses = rows(LOSSES, len(losses), callback=losses['callback'],
                       time=losses['timestamp'], count=losses['count'])
         stops = self._pop(_STOP)
-        notices_stops = earliest(stops['end'])
-        stops = stops[stops['begin'] < stops['end']]    # the first one is empty: stops are noticed
+        # recordings of earlier versions begin with an empty one
+        stops = stops[stops['begin'] < stops['end']]
         stops = rows(STOPS, len(stops), start=stops['begin'], end=stops['end'])
         lost = sum(self._pop(_LOST)['count'].tolist())
         drops, reasons = self._drops()
         run = self._put_in_order(self._with_end(Run(
-            self._name, self._head, self._task_set, self._task_set, notices_stops=notices_stops,
+            self._name, self._head, self._task_set, self._task_set,
             workers_each=self._head.workers, start=begin_of(releases, executions))), executions, [
             (releases, releases['noticed'], released_at),
             (job_ends, job_ends['time'], ends_at)], completed)

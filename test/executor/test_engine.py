@@ -920,6 +920,25 @@ def test_a_parked_thread_looks_soon_for_what_comes_during_a_short_callback(
         pool.running = False
 
 
+def test_what_becomes_due_while_no_thread_waits_wakes_one_in_the_next_spin(make_executor):
+    """One that is just leaving may have been woken for it in vain."""
+    pool = pool_of(make_executor())
+    with pool.lock:
+        pool.running, pool.polling = True, 1
+        now = pool.tick() - pool.offset
+        pool.agenda.set(Appointment(), now, now)
+        pool.due.arm(now)
+        assert pool.loop.wait(10.0)
+        pool.polling = 0
+    pool.pause()
+    assert not pool.loop.wait(0)
+    with pool.lock:
+        pool.running, pool.polling = True, 1
+        pool.due.arm(now)
+        pool.running, pool.polling = False, 0
+    assert pool.loop.wait(10.0)
+
+
 class Eager(Entity):
     """An entity for which a thread has to wait, also while a callback computes."""
 
