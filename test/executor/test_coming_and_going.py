@@ -297,6 +297,22 @@ def test_names_of_destroyed_callbacks_are_kept_up_to_a_bound(
     assert ran.count(0) in [each['ran'] for name, each in counts.items() if '/helper_0' in name]
 
 
+def test_a_node_is_forgotten_when_its_last_callback_ends(make_executor, make_node):
+    """Though nothing else happens then."""
+    executor, node, begun = make_executor(num_workers=2), make_node(), threading.Event()
+    go_on = threading.Event()
+    node.create_guard_condition(lambda: (begun.set(), go_on.wait(30.0))).trigger()
+    executor.add_node(node)
+    registry = registry_of(executor)
+    with Spinning(executor):
+        assert begun.wait(15.0)
+        executor.remove_node(node)
+        assert wait_for(lambda: registry._retired)
+        assert wait_for(lambda: pool_of(executor).is_current)
+        go_on.set()
+        assert wait_for(lambda: not registry._retired)
+
+
 def test_nodes_that_are_removed_and_come_back_without_a_spin_leave_no_descriptors(
         make_executor, make_node):
     """Also if several are, one after the other: each listens once again."""

@@ -903,6 +903,34 @@ def test_what_computes_is_checked_when_something_comes_that_waits_for_it(make_ex
         pool.running, pool.polling = False, 0
 
 
+def test_what_a_thread_finds_waiting_when_it_looks_is_checked_for(make_executor):
+    """What has the interpreter runs longer than usual: it may wait."""
+    pool = pool_of(make_executor(num_workers=3))
+    me, entities = WorkerThread(pool, None), [new_entity(holds=True) for _ in range(2)]
+    with pool.lock:
+        pool.running = True
+        pool.engine.ready(Work(entities[0], print), pool.tick())
+        assert pool._choose(me, pool.now)
+        pool.engine.ready(Work(entities[1], print), pool.tick())
+        assert pool.agenda.next == NEVER
+        pool._look()
+        assert pool.agenda.next < NEVER
+        pool.running = False
+
+
+def test_a_step_can_be_woken_again_after_a_worker_has_looked(make_executor):
+    """The look of a callback that has outlasted a spin takes the event that was to wake it."""
+    pool = pool_of(make_executor())
+    with pool.lock:
+        pool.running = pool.is_spin_once = True
+        pool.call()
+        pool._look()
+        assert not pool.loop.wait(0)
+        pool.call()
+        assert pool.loop.wait(0)
+        pool.running = pool.is_spin_once = False
+
+
 def test_a_parked_thread_looks_soon_for_what_comes_during_a_short_callback(
         make_executor, monkeypatch):
     """In case that the callback takes longer this time."""

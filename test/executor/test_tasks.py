@@ -194,6 +194,25 @@ def test_a_coroutine_that_awaits_something_unknown_is_asked_again(make_executor,
     assert task.done() and task.result() == 'done' and turns == [0, 1, 2, 3, 4]
 
 
+def test_the_callback_group_of_a_coroutine_that_never_goes_on_is_free_again(
+        make_executor, make_node):
+    """The node may run in another executor then."""
+    node, begun, ran, future = make_node(), [], [], Future()
+
+    async def waits():
+        begun.append(1)
+        await future
+
+    guard = node.create_guard_condition(waits)
+    guard.trigger()
+    with Spinning(make_executor(nodes=[node])):
+        assert wait_for(lambda: begun)
+    other = node.create_guard_condition(lambda: ran.append(1))
+    other.trigger()
+    with Spinning(make_executor(nodes=[node])):
+        assert wait_for(lambda: ran)
+
+
 def test_a_coroutine_that_only_asks_again_and_again_takes_little_of_the_cpu(make_executor):
     """It rests for a microsecond more each time."""
     executor, turns = make_executor(), []
