@@ -14,9 +14,13 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     over four fifths of wall, the callback holds the GIL.  If own is less than half of the time in
     which no other thread computed, the callback waits for something else and does not hold the
     GIL, unless it was preempted on its CPU and may have waited for that.  Anything between is
-    inconclusive.  Each execution is measured until the habit is known.  After that one in
-    ``SELDOM`` short executions is, one in ``LATELY`` of a callback that waits for long, and each
-    one of a callback that computes for long or has just behaved differently.
+    inconclusive.  Until the habit is known, and after an inconclusive execution, the kernel is
+    asked how long the thread of a long callback has waited for a CPU.  This time does not count
+    as a part of wall, and preemptions do not matter then.  (A callback that sleeps for a second
+    is always preempted on a busy machine: without that time, nothing would ever follow.)
+    Each execution is measured until the habit is known.  After that one in ``SELDOM`` short
+    executions is, one in ``LATELY`` of a callback that waits for long, and each one of a callback
+    that computes for long or has just behaved differently.
 2.  *Unknown.*  After inconclusive first executions, the next ones are treated as if they held the
     GIL: then no other callback computes, and the measurement is conclusive.  Later, one execution
     is treated so (a trial) after every ``LATELY`` inconclusive ones.
@@ -42,6 +46,9 @@ from resource import getrusage, RUSAGE_THREAD
 import sys
 import threading
 from time import monotonic_ns, process_time_ns, thread_time_ns
+
+from mddag_executor.executor.bounds import SHORT_CALLBACK_NS
+from mddag_executor.executor.gil_check import cpu_wait_ns
 
 COMPUTES = 0.8
 """A callback that computes for this fraction of its time holds the GIL."""
@@ -81,10 +88,11 @@ class GilHabit:
         count; -1: there was no other one yet.
     :ivar is_known: whether ``holds`` is declared, or has been measured.
     :ivar rests: how many of its next executions need not be measured, if it is positive.
+    :ivar unclear: how many inconclusive executions were measured last, one after the other.
     """
 
     __slots__ = ('holds', 'computes', 'mean_ns', 'needs_ns', 'is_known', 'is_declared', 'rests',
-                 'share', '_least', '_first', '_unclear', '_runs', '_is_trial', '_has_waited')
+                 'share', 'unclear', '_least', '_first', '_runs', '_is_trial', '_has_waited')
 
     def __init__(self, declared: bool | None = None) -> None:
         self.is_declared = self.is_known = declared is not None
@@ -94,7 +102,7 @@ class GilHabit:
         self._first = FIRST_RUNS
         self.rests = 0
         self.share: float | None = None if declared is None else float(declared)
-        self._unclear = 0
+        self.unclear = 0
         self._runs = 0
         self._is_trial = False
         # whether it is known to wait, and has when it was last measured
@@ -122,14 +130,21 @@ class GilHabit:
             self.needs_ns = self.mean_ns if self.computes else max(
                 self.mean_ns, self._least)
 
+    @property
+    def is_doubtful(self) -> bool:
+        """Return whether its next execution should be measured exactly (25 us)."""
+        return not self.is_declared and (not self.is_known or self.unclear > 0) and (
+            not self._runs or max(self.mean_ns, self._least) > SHORT_CALLBACK_NS)
+
     def learn(self, wall: int, own: int, others: int, starved: bool = False) -> None:
         """
         Update whether it holds the GIL from the execution that was last given to ``took``.
 
-        :param wall: its duration, ns.
+        :param wall: its duration, ns, without the time in which it waited for a CPU if that is
+            known.
         :param own: CPU time of its thread, ns.
         :param others: CPU time of all other threads of the process meanwhile, ns.
-        :param starved: whether another thread preempted it on its CPU meanwhile.
+        :param starved: whether ``wall`` may contain time in which it waited for a CPU.
         """
         if not self.is_declared:
             self._learn(wall, own, others, starved)
@@ -164,18 +179,18 @@ class GilHabit:
         else:
             had = max(own, wall - others)
             if own >= SHORT_NS and (starved or own >= WAITS * had):
-                self._unclear += 1
+                self.unclear += 1
                 if self.share is None:
                     self.holds = 1
-                elif self._unclear >= LATELY:
-                    self._unclear = 0
+                elif self.unclear >= LATELY:
+                    self.unclear = 0
                     self._is_trial = not usual
                     self.holds = 1
                 else:
                     self.holds = usual
                 return
             part = own / max(1, had)
-        self._unclear = 0
+        self.unclear = 0
         share = self.share
         self.share = part if share is None else share + (part - share) / self._runs
         self.is_known = True
@@ -191,13 +206,16 @@ class Measurement:
     :ivar is_complete: whether it updates the habit.
     """
 
-    __slots__ = ('_habit', '_process', '_preempted', '_own', '_start', '_sums', 'is_complete')
+    __slots__ = ('_habit', '_process', '_preempted', '_own', '_start', '_sums', '_cpu_wait',
+                 'is_complete')
 
     def __init__(self, habit: GilHabit) -> None:
         self._habit = habit
         # other threads may change the habit meanwhile, so it is asked once
         self.is_complete = habit.rests < 1
         self._sums: list[int] | None = [0, 0, 0] if self.is_complete else None
+        # how long it has waited for a CPU; None: this is not asked, or not known
+        self._cpu_wait: int | None = 0 if self.is_complete and habit.is_doubtful else None
         self._own = 0
         self._process = self._preempted = self._start = 0
         self.resume()
@@ -205,6 +223,7 @@ class Measurement:
     def resume(self) -> None:
         """Begin to measure again."""
         if self._sums is not None:
+            self._count_cpu_wait(-1)
             self._start, self._process = monotonic_ns(), process_time_ns()
             self._preempted = times_preempted()
         self._own -= thread_time_ns()
@@ -216,6 +235,12 @@ class Measurement:
             self._sums[0] += monotonic_ns() - self._start
             self._sums[1] += process_time_ns() - self._process
             self._sums[2] += times_preempted() - self._preempted
+            self._count_cpu_wait(1)
+
+    def _count_cpu_wait(self, sign: int) -> None:
+        if self._cpu_wait is not None:
+            now = cpu_wait_ns()
+            self._cpu_wait = None if now is None else self._cpu_wait + sign * now
 
     def end(self) -> int:
         """Return the CPU time of the calling thread, ns."""
@@ -226,7 +251,9 @@ class Measurement:
         else:
             wall, process, preempted = self._sums
             self._habit.took(own, wall)
-            self._habit.learn(wall, own, process - own, preempted > 0)
+            waited = self._cpu_wait
+            self._habit.learn(
+                wall - (waited or 0), own, process - own, preempted > 0 and waited is None)
         return own
 
 

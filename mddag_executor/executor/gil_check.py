@@ -69,18 +69,30 @@ _libc = ctypes.PyDLL(None)  # the GIL is kept during calls
 _libc.read.restype = ctypes.c_ssize_t
 
 
-def _first_argument(tid: int) -> int:
-    """Return that of the system call that a thread sleeps in; -1: it runs; 0: it is not known."""
-    file = _libc.open(f'/proc/self/task/{tid}/syscall'.encode(), os.O_RDONLY | os.O_CLOEXEC)
+def _fields(path: str) -> list[bytes]:
+    """Return the words in a small file of the kernel, and keep the GIL; none if it is missing."""
+    file = _libc.open(path.encode(), os.O_RDONLY | os.O_CLOEXEC)
     if file < 0:
-        return 0
+        return []
     buffer = ctypes.create_string_buffer(256)
     size = _libc.read(file, buffer, len(buffer))
     _libc.close(file)
-    fields = buffer.raw[:max(0, size)].split(None, 2)
+    return buffer.raw[:max(0, size)].split()
+
+
+def _first_argument(tid: int) -> int:
+    """Return that of the system call that a thread sleeps in; -1: it runs; 0: it is not known."""
+    fields = _fields(f'/proc/self/task/{tid}/syscall')
     if len(fields) == 1:
         return -1
     return int(fields[1], 16) if fields else 0
+
+
+def cpu_wait_ns() -> int | None:
+    """Return how long the calling thread has waited for a CPU in its life; None: unknown."""
+    fields = _fields('/proc/thread-self/schedstat')
+    # a kernel that does not count this shows zeros; each thread has had at least one turn
+    return int(fields[1]) if len(fields) == 3 and fields[2] != b'0' else None
 
 
 def _is_shown() -> bool:

@@ -4,6 +4,7 @@
 
 from contextlib import contextmanager
 import ctypes
+from itertools import count
 import os
 import queue
 import select
@@ -13,13 +14,15 @@ import sys
 import threading
 import time
 
-from mddag_executor.executor import gil_check
-from mddag_executor.executor.gil import short_switch_interval
+from mddag_executor.executor import gil, gil_check
+from mddag_executor.executor.gil import GilHabit, Measurement, short_switch_interval
 from mddag_executor.executor.gil_check import CHECK_NS, GilCheck, LAST_CHECK_NS, waits_for_else
 import pytest
 
 from .conftest import wait_for
 
+shown = pytest.mark.skipif(
+    not gil_check._is_shown(), reason='this kernel does not show what threads do')
 MS = 1_000_000
 keeps_gil = ctypes.PyDLL(None)
 
@@ -60,6 +63,7 @@ def load(processes):
             each.wait()
 
 
+@shown
 @pytest.mark.parametrize('processes', [0, 4])
 def test_a_thread_that_waits_for_the_gil_is_never_taken_for_one_that_waits(processes):
     """However many want it, and however busy the CPUs are."""
@@ -151,6 +155,7 @@ def test_what_is_more_urgent_is_not_kept_waiting_by_the_checks_of_before():
     assert gaps == sorted(gaps) and gaps[-1] == LAST_CHECK_NS
 
 
+@shown
 @pytest.mark.parametrize('processes', [0, 4])
 def test_a_callback_that_computes_keeps_the_gil(processes):
     with load(processes), threads(*[computes] * 3) as (thread, *_):
@@ -235,3 +240,33 @@ if not child:
 sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     assert subprocess.run([sys.executable, '-c', program], timeout=120).returncode == 0
+
+
+def computes_a_bit_and_sleeps():
+    for _ in range(10):
+        sum(range(10_000))
+        time.sleep(0.005)
+
+
+def computes_for_20_ms():
+    end = time.thread_time() + 0.02
+    while time.thread_time() < end:
+        pass
+
+
+@pytest.mark.skipif(
+    gil_check.cpu_wait_ns() is None, reason='this kernel does not show how long threads wait')
+@pytest.mark.parametrize('processes', [0, 4])
+@pytest.mark.parametrize(
+    'body, holds', [(computes_a_bit_and_sleeps, 0), (computes_for_20_ms, 1)])
+def test_preemptions_do_not_hide_whether_a_callback_holds_the_gil(
+        monkeypatch, processes, body, holds):
+    """A callback that sleeps for long is always preempted on a busy machine."""
+    monkeypatch.setattr(gil, 'times_preempted', count().__next__)
+    habit = GilHabit()
+    with load(processes):
+        for _ in range(3):
+            measurement = Measurement(habit)
+            body()
+            measurement.end()
+    assert (habit.is_known, habit.holds) == (True, holds)
