@@ -137,10 +137,19 @@ def shown_tip(browser):
 
 
 def colours_of(browser, name):
-    """Return how many pixels of a picture have each colour."""
+    """
+    Return how many pixels of a picture have each colour.
+
+    They are those of a copy: Chromium complains of a page that reads a canvas again and again, as
+    this does until a slow machine has drawn it.
+    """
     return browser.execute_script("""
         const canvas = document.getElementById(`mddag-${arguments[0]}`), found = {};
-        const {data} = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+        const {width, height} = canvas;
+        const copy = new OffscreenCanvas(width, height).getContext(
+          '2d', {willReadFrequently: true});
+        copy.drawImage(canvas, 0, 0);
+        const {data} = copy.getImageData(0, 0, width, height);
         for (let i = 0; i < data.length; i += 4) {
           const colour = '#' + [0, 1, 2].map(
             (c) => data[i + c].toString(16).padStart(2, '0')).join('');
