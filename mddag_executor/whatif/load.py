@@ -342,7 +342,7 @@ class LoadBuilder:
 
     def _note_elsewhere(self) -> None:
         """Let callbacks that ran elsewhere end when their first message arrived."""
-        known = self._typical()
+        known = {*self._declared_times(), *self._recorded_times(), *self._longest_incomplete()}
         for dag, publishers in zip(self._task_set.dags, map(np.array, self._publishers)):
             took, start, end, arrived, noticed = self._of(
                 dag.index, 'took', 'start', 'end', 'arrived', 'noticed')
@@ -679,22 +679,29 @@ class LoadBuilder:
 
         Otherwise it is the longest time of an execution that did not complete.
         """
-        recorded: dict[str, list[Any]] = {}
-        for dag in self._task_set.dags:
-            took, = self._of(dag.index, 'took')
-            for vertex in dag.vertices:
-                recorded.setdefault(vertex.callback.key, []).append(took[:, vertex.index])
-        typical = {
-            c.key: c.execution_time.mean_ns
-            for c in self._task_set.callbacks if c.execution_time is not None}
-        for key, parts in recorded.items():
-            times = np.sort(np.concatenate(parts))
-            times = times[times >= 0]
-            if len(times):
-                typical[key] = quantile(memoryview(times), 0.5)
+        typical = self._declared_times()
+        for key, parts in self._recorded_times().items():
+            typical[key] = quantile(memoryview(np.sort(np.concatenate(parts))), 0.5)
         for key, so_far in self._longest_incomplete().items():
             typical.setdefault(key, so_far)
         return typical
+
+    def _declared_times(self) -> dict[str, int]:
+        """Return by callback its mean execution time, if that is declared."""
+        return {c.key: c.execution_time.mean_ns
+                for c in self._task_set.callbacks if c.execution_time is not None}
+
+    def _recorded_times(self) -> dict[str, list[Ints]]:
+        """Return by callback its known execution times, without callbacks that have none."""
+        recorded: dict[str, list[Ints]] = {}
+        for dag in self._task_set.dags:
+            took, = self._of(dag.index, 'took')
+            for vertex in dag.vertices:
+                times = took[:, vertex.index]
+                times = times[times >= 0]
+                if len(times):
+                    recorded.setdefault(vertex.callback.key, []).append(times)
+        return recorded
 
     def _longest_incomplete(self) -> dict[str, int]:
         """Return by callback the longest time of an execution that did not complete."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..executor.conftest import make_node, wait_for
 
-__all__ = ['GUESTS', 'has_ended', 'make_node', 'TWO_PROCESSES', 'wait_for']
+__all__ = ['GUESTS', 'is_gone', 'make_node', 'TWO_PROCESSES', 'wait_for']
 
 GUESTS = Path(__file__).resolve().parent / 'guests'
 TWO_PROCESSES = """\
@@ -18,7 +18,7 @@ processes: {one: [/a], two: [/b]}
 """
 
 
-def has_ended(pid):
+def is_gone(pid):
     """Tell whether a process is gone; no process may be there to take note of its end."""
     try:
         return ') Z ' in Path(f'/proc/{pid}/stat').read_text()

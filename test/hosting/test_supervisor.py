@@ -15,7 +15,7 @@ from mddag_executor.hosting import processes as module
 from mddag_executor.hosting.processes import Run, Supervisor
 import pytest
 
-from .conftest import has_ended, wait_for
+from .conftest import is_gone, wait_for
 from .helpers import Idle
 
 # Ready for SIGTERM, a program notes that in a file, whose name replaces MARK; others wait for it.
@@ -188,7 +188,7 @@ def test_a_child_does_not_outlive_who_started_it(tmp_path, code):
     finally:
         parent.kill()
         parent.wait()
-    assert wait_for(lambda: has_ended(int(mark.read_text())), 60.0)
+    assert wait_for(lambda: is_gone(int(mark.read_text())), 60.0)
 
 
 # Its first thread ends, as it does first in a process that was killed; the second one waits.
