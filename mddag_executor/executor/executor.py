@@ -136,8 +136,8 @@ class MultiDeadlineExecutor(BareExecutor):
     :param worker_priority: their priority under it.
     :param worker_cpus: the CPUs that they may use.
     :param freeze_gc: when the first spin begins, collect garbage and exempt all existing objects
-        from later collections (``gc.freeze``) until the executor ends: for programs that make
-        their nodes first.
+        from later collections (``gc.freeze``) until the executor ends, which unfreezes what the
+        program itself has frozen as well: for programs that make their nodes first.
     :param diagnostics_period: how often to publish on ``/diagnostics`` during a spin: as
         ``default_deadline``; None or 0: never.
     :param thresholds: the limits beyond which a status of the diagnostics is worse than OK.
