@@ -14,7 +14,8 @@ The rules are the same for live runs and recordings. Observations are counts by 
    releases are needed. A sporadic source may be released less often.
    *stopped*: a source that is not sporadic and fires more than once was not released any more in
    the last ``LEAST`` of its periods, and not in the last ``SILENCE_NS``. Its results were all in
-   time up to then, so no verdict shows this.
+   time up to then, so no verdict shows this. A callback whose timer, subscription or service was
+   destroyed has stopped as well, and so has a sync that lacks one of its subscriptions.
 3. *rate* of a subscription: it received messages more or less often than the callbacks that
    publish them ran here, by more than ``TOLERANCE``. At least ``LEAST`` expected messages are
    needed. Dropped messages count as received: their loss says nothing about the declaration. So
@@ -95,6 +96,8 @@ class Observed:
         not checked.
     :ivar publishes: by callback, the topics that it published, declared or not.
     :ivar published: by callback and topic, the number of messages; without unknown ones.
+    :ivar gone: by callback that lacks its timer, subscription or service at the end: for how long,
+        ns.
     :ivar nodes: the nodes that were seen; None if unknown.
     :ivar undeclared: the undeclared entities that were seen.
     :ivar outside: messages that no declared callback has published: node, topic, the undeclared
@@ -116,6 +119,7 @@ class Observed:
     blocked: Set[str] = frozenset()
     outside: Sequence[tuple[str, str, str, int]] = ()
     published: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    gone: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -226,6 +230,8 @@ def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
                 callback, of_callback, observed.nodes, task_set):
             continue
         why = _never_ran(callback, of_callback, observed) if callback.key in certain else None
+        if why is None and callback.key in certain:
+            why = _gone(callback, of_callback, observed)
         if why is None:
             if callback.period_ns is not None:
                 why = _source_rate(callback, callback.period_ns, observed)
@@ -275,6 +281,21 @@ def _never_ran(callback: Callback, dags: list[Dag], observed: Observed) -> Drift
         observed.undeclared)
     return Drift('never ran', callback.key, topic, None, 0,
                  printable(text if question is None else f'{text}: {question}'))
+
+
+def _gone(callback: Callback, dags: list[Dag], observed: Observed) -> Drift | None:
+    period = max((dag.period_ns for dag in dags), default=0)
+    lacks = observed.gone.get(callback.key, 0)
+    if callback.once or lacks <= max(SILENCE_NS, LEAST * period):
+        return None
+    what = 'a subscription' if callback.kind == 'sync' else f'the {callback.kind}'
+    text = (f'{what} of {callback.key} was destroyed {lacks / 1e9:.3f} s before the end (its '
+            'program destroyed it, or has ended)')
+    if callback.kind == 'timer':
+        text += f": if it {_SPORADIC[True]}, declare 'sporadic: true'"
+    else:
+        text += ': results that need it are missed after that'
+    return Drift('stopped', callback.key, None, period, lacks, printable(text))
 
 
 def _source_rate(callback: Callback, period: int, observed: Observed) -> Drift | None:

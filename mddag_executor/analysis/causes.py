@@ -85,7 +85,8 @@ REMEDIES = {
     'dropped': 'shorter callbacks before it; for messages a longer queue (QoS depth, or without '
                '`keep: newest`); a late release of a timer is dropped when its next one is '
                'ready: less load, or a longer deadline',
-    'destroyed': 'keep the node and its subscription until the job has ended',
+    'destroyed': 'let the program and the node run on, and keep the subscription; if the node '
+                 'is meant to end before the others, judge the time before that (--to)',
     'withdrawn': 'nothing, if the program meant it: it reset or cancelled the timer while its '
                  'callback waited; else a longer period, or shorter callbacks before it',
     'not published': 'publish in each execution of the callback before it, or declare the topic '
@@ -223,6 +224,7 @@ class Never(NamedTuple):
     :ivar started: executions that were started, a table of ``STARTED``.
     :ivar unpublished: by miss whether the callback before did not publish the message.
     :ivar is_driven: by vertex whether it is a driven sync.
+    :ivar gone: by vertex when an entity that it lacked until the end was destroyed, ns; or never.
     :ivar knows_waiting: whether the executions that waited at the end are recorded: each process
         has ended in order.
     """
@@ -232,6 +234,7 @@ class Never(NamedTuple):
     started: Table
     unpublished: Mask
     is_driven: Mask
+    gone: Ints
     knows_waiting: bool
 
     def drops_of(self, vertex: Ints, job: Ints) -> Ints:
@@ -244,7 +247,7 @@ class Never(NamedTuple):
 
     def causes(self, miss: Ints, vertex: Ints, job: Ints, begin: Ints, end: Ints) -> Ints:
         """Return why vertices of jobs of misses never ran, which did not wait at the end."""
-        lost = np.full(len(miss), LOST)
+        lost = np.where(self.gone[vertex] < end, DESTROYED, LOST)
         for each, (times, causes) in self.dropped_at.items():
             mine = np.flatnonzero(vertex == each)
             first, last = (np.searchsorted(times, time[mine]) for time in (begin, end))

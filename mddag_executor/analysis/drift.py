@@ -17,6 +17,7 @@ from collections.abc import Mapping, Set
 
 from mddag_executor.recording.joins import different, distinct, rows_by, whole_periods
 from mddag_executor.recording.mapping import declared_keys
+from mddag_executor.recording.names import Names
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.tables import VERTEX
 from msg_graph.drift import Drift, drift, Observed, Releases
@@ -56,20 +57,17 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     waits = (end < 0) & (start >= recording.end)
     late = (end >= since) | (end < 0)
     numbers, callback_of = recording.callbacks()
+    keys = keys_of(recording)
     counts, late_counts, late_got = (dict(zip(numbers.tolist(), np.bincount(
         callback_of[which], minlength=len(numbers)).tolist()))
         for which in (every & ~waits, every & ~waits & late, every & late))
-    for callback, vertex in zip(
-            numbers.tolist(), recording.vertices_of_callbacks(declared).tolist()):
-        if vertex >= 0:
-            keys[callback] = vertices[vertex].callback.key
     ran: Counter[str] = Counter()
     got = Counter(vertices[v].callback.key for v in recording.drops['vertex'][
         recording.drops['time'] >= since].tolist() if v >= 0)
-    for callback, key in keys.items():
+    for number, key in keys.items():
         # once, if only in the warm-up
-        ran[key] += late_counts.get(callback, 0) or min(1, counts.get(callback, 0))
-        got[key] += late_got.get(callback, 0)
+        ran[key] += late_counts.get(number, 0) or min(1, counts.get(number, 0))
+        got[key] += late_got.get(number, 0)
     whole = (recording.whole or recording).releases['dag']
     for dag in judge.dags:      # what fires once may have fired before the part that is judged
         source = dag.vertices[dag.source].callback
@@ -108,13 +106,44 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
             outside[publisher.node.name, publisher.topic, (
                 '' if callback is None else names.name(callback))] += int(judged_counts[pair])
     bound = declared_keys(names, judge)
+    gone = {key: max(0, recording.end - at) for key, at in gone_at(names, keys).items()}
     return drift(judge, Observed(
         max(0, recording.end - recording.run.begin), releases,
         dict(got), dict(ran), came, publishes, set(names.nodes) or None,
         [each.entity for each in names.made
          if each.entity is not None and each.number not in bound], periods, recording.end,
         _blocked(recording, keys),
-        [(*key, count) for key, count in outside.items() if count], published))
+        [(*key, count) for key, count in outside.items() if count], published, gone))
+
+
+def keys_of(recording: Recording) -> dict[int, str]:
+    """Return by callback the declared one: that of the vertex that it ran as, or that fits."""
+    keys = declared_keys(recording.names, recording.run.recorded_set)
+    table, vertices = recording.executions, recording.task_set.vertices
+    ran_as = recording.vertices_of_callbacks((table['vertex'] >= 0) & (table['start'] >= 0))
+    keys.update(
+        (callback, vertices[vertex].callback.key)
+        for callback, vertex in zip(recording.callbacks()[0].tolist(), ran_as.tolist())
+        if vertex >= 0)
+    return keys
+
+
+def gone_at(names: Names, keys: Mapping[int, str]) -> dict[str, int]:
+    """
+    Return by declared callback when an entity disappeared that it lacks until the end.
+
+    :param keys: the declared callback of each callback.
+    """
+    times: defaultdict[tuple[str, str], list[int | None]] = defaultdict(list)
+    for callback in names.callbacks:
+        if callback.number in keys:
+            times[keys[callback.number], callback.start].append(callback.gone)
+    gone: dict[str, int] = {}
+    for (key, _), of_topic in times.items():
+        known = [at for at in of_topic if at is not None]
+        if len(known) == len(of_topic):
+            gone[key] = min(gone.get(key, max(known)), max(known))
+    return gone
 
 
 def _blocked(recording: Recording, keys: Mapping[int, str]) -> set[str]:

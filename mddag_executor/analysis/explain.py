@@ -41,6 +41,7 @@ from mddag_executor.analysis.causes import (
 )
 from mddag_executor.analysis.chains import Chains, LINKS
 from mddag_executor.analysis.deadlines import Judged
+from mddag_executor.analysis.drift import gone_at, keys_of
 from mddag_executor.analysis.spans import crowded, Spans
 from mddag_executor.analysis.usage import in_groups, ran
 from mddag_executor.core import legs_of
@@ -108,7 +109,7 @@ class Explanation:
             *self._dropped(), self._started(chains.waited.group), self._unpublished(missed),
             np.array([*(v.callback.driven_by is not None for v in self._task_set.vertices),
                       False]),
-            self._knows_waiting)
+            self._gone(), self._knows_waiting)
         self.found = find(
             missed, links, pool, usual, self._never,
             np.array([*self._tables.dag_of, 0], dtype=np.int64),
@@ -306,6 +307,12 @@ class Explanation:
             vertex: (drops['time'][mine], causes[mine])
             for vertex in np.flatnonzero(np.isin(place[:-1], of)).tolist()
             for mine in [without[of == place[vertex]]]}
+
+    def _gone(self) -> Ints:
+        """Return by vertex when it lost an entity that it lacked until the end."""
+        gone = gone_at(self._recording.names, keys_of(self._recording))
+        return np.array([*(gone.get(v.callback.key, _NO_END) for v in self._task_set.vertices),
+                         _NO_END], dtype=np.int64)
 
     def _unpublished(self, missed: Table) -> Mask:
         """

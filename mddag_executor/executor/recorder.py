@@ -99,6 +99,12 @@ class Recorder:
             if entity.address:
                 self._say('program', entity.address, entity.outer)
 
+    def gone(self, entities: Iterable[Entity]) -> None:
+        """Record that entities have disappeared."""
+        for entity in entities:
+            if entity.address and not entity.is_own:
+                self._say('gone', entity.address)
+
     def _node(self, node: Any) -> None:
         address = id(node)
         if node not in self._known:

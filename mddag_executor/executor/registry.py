@@ -164,7 +164,7 @@ class Registry:
                             moved.append(entity)
         gone = [each for key, each in self.by_id.items() if key not in present]
         for each in gone:  # first: a new one may be their callback's next entity
-            self.bindings.unbind(each)
+            self.bindings.unbind(each, now)
         appeared = [self._appear(*each, now) for each in new]
         added = [each for each in appeared if each is not None]
         present.update((id(each.rclpy_object), each) for each in added)
@@ -180,6 +180,7 @@ class Registry:
         for each in gone:
             engine.remove(each, now)
         if self._recorder is not None:
+            self._recorder.gone(gone)
             self._recorder.entities(found, added)
             singles = {group.number for group in self.outer_groups.values()
                        if group is not None and group.is_single}

@@ -33,6 +33,7 @@ class Watch:
         self._releases = [Releases() for _ in task_set.dags]
         self._before: Mapping[str, CallbackCounts] = {}
         self._outside_before = self._outside = executor.published_outside()
+        self._gone: dict[str, int] = {}
         executor._engine.verdicts.on_release = self._released
 
     def _released(self, dag: int, release: int) -> None:
@@ -50,6 +51,7 @@ class Watch:
         """Watch no longer: the run has ended."""
         if self._end is None:
             self._end = self._now()
+            self._gone = self._executor._registry.bindings.gone()
             self._outside = self._executor.published_outside()
 
     def drift(self, statistics: Statistics) -> list[Drift]:
@@ -60,6 +62,7 @@ class Watch:
         """Return the observations; ``statistics`` are the run's counts."""
         first = min((r.first for r in self._releases if r.count), default=self._begin)
         counts, end = statistics['callbacks'], self._now() if self._end is None else self._end
+        gone = self._executor._registry.bindings.gone() if self._end is None else self._gone
         sources = (dag.vertices[dag.source].callback.key for dag in self._task_set.dags)
         return Observed(
             duration_ns=max(0, end - first), end_ns=end,
@@ -70,6 +73,7 @@ class Watch:
             publishes={**self._executor._registry.bindings.published()},
             nodes={key.rpartition(':')[0] for key in counts},
             undeclared=self._executor._registry.bindings.undeclared(),
+            gone={key: max(0, end - at) for key, at in gone.items()},
             outside=since(
                 self._executor.published_outside() if self._end is None else self._outside,
                 self._outside_before))

@@ -48,10 +48,11 @@ class Callback:
     :ivar group: number of its mutually exclusive group; -1: reentrant, None: unknown.
     :ivar symbol: of its function; empty if not recorded.
     :ivar address: process and address of its callback; of several the last one.
+    :ivar gone: when it was destroyed or left the executor, ns; None: this is not recorded.
     """
 
     __slots__ = ('number', 'node', 'kind', 'start', 'period', 'made', 'grid', 'group', 'symbol',
-                 'label', 'address', 'rmw')
+                 'label', 'address', 'rmw', 'gone')
 
     def __init__(self, node: Node | None, kind: str, start: str = '', period: int = 0,
                  made: int = 0, grid: int | None = None) -> None:
@@ -67,6 +68,7 @@ class Callback:
         self.label = ''
         self.address: Address | None = None
         self.rmw: Address | None = None
+        self.gone: int | None = None
 
     @property
     def node_name(self) -> str:

@@ -43,12 +43,12 @@ _GROUPS = (
     'add_callback_group', 'add_callback_group_static_executor',
     'callback_group_to_executor_entity_collector',
     *(f'callback_group_add_{kind}' for kind in KINDS))
-_PROGRAM = 'program'
+_PROGRAM, _GONE = 'program', 'gone'
 _CARET_INIT = 'ros2_caret:caret_init'
 #: Full names of the initialisation events that this executor records, and of all of them.
 OWN_INIT_EVENTS = frozenset([
     *(f'ros2:{name}' for name in _INIT), *(f'ros2_caret:{name}' for name in _GROUPS),
-    f'mddag:{_PROGRAM}'])
+    f'mddag:{_PROGRAM}', f'mddag:{_GONE}'])
 INIT_EVENTS = OWN_INIT_EVENTS | {
     *(f'ros2_caret:{name}' for name in _INIT), _CARET_INIT, 'ros2_caret:rmw_implementation'}
 
@@ -157,7 +157,7 @@ class Entities:
             if same not in seen or 'init_timestamp' not in fields:
                 by_kind.setdefault(name, []).append(fields)
             seen.add(same)
-        for name in (*_INIT, *_GROUPS, _PROGRAM):
+        for name in (*_INIT, *_GROUPS, _PROGRAM, _GONE):
             for fields in sorted(by_kind.get(name, ()), key=lambda f: f['_timestamp']):
                 self._one(name, fields)
         self.label({})
@@ -208,6 +208,10 @@ class Entities:
                 key = pid, f['program']
                 self.names.programs[callback.number] = self._programs.setdefault(
                     key, len(self._programs))
+        elif name == _GONE:
+            callback = self.callbacks.latest(pid, f['callback'], time)
+            if callback is not None:
+                callback.gone = time
         elif name in _GROUPS and self._groups.nearest(
                 pid, f['callback_group_addr'], time) is None:
             self._n_groups += 1

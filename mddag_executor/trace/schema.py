@@ -153,6 +153,8 @@ _ALL = (
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     # the callback is of a program that runs its callbacks one at a time; the number of the program
     _event('mddag', 'program', callback=_U64, program=_I64),
+    # the timer, subscription or service of the callback was destroyed, or left the executor
+    _event('mddag', 'gone', callback=_U64),
     _event('mddag', 'judge_from', release=_I64),
     _event('mddag', 'job_release', dag=_I32, job=_I64, release=_I64),
     # of an execution that belongs to no job: the deadline that it inherits, 0: none; the due time

@@ -8,7 +8,7 @@ import time
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from mddag_executor import open_recording
+from mddag_executor import open_recording, replay
 from mddag_executor.analysis.drift import drift_of
 from mddag_executor.core import Tables, Tally
 from mddag_executor.core.requirements import RequirementTally
@@ -260,6 +260,53 @@ def test_what_ran_before_the_begin_is_no_drift(make_executor, make_node):
         found = watch.drift(executor.statistics())
     # a machine that stops for a second skips releases
     assert [each for each in found if each.callback == '/eye:see'] == []
+
+
+@pytest.mark.parametrize('is_made_again', [False, True])
+def test_a_callback_whose_node_has_ended_is_named(
+        make_executor, make_node, tmp_path, is_made_again):
+    """Its messages were published, and are lost for no other reason."""
+    task_set = loads(graph(
+        camera='name: grab, timer: 20ms, publishes: [/image]',
+        eye='name: see, subscription: /image, deadline: 300ms'))
+    path = tmp_path / 'run.mcap'
+    executor = make_executor(task_set, num_workers=2, trace=path)
+    watch = Watch(executor, task_set)
+    camera, seen = make_node('camera'), []
+    image = camera.create_publisher(Empty, 'image', 10)
+    camera.create_timer(0.02, lambda: image.publish(Empty()))
+    executor.add_node(camera)
+
+    def see():
+        eye = make_node('eye')
+        eye.create_subscription(Empty, 'image', seen.append, 10)
+        executor.add_node(eye)
+        before = len(seen)
+        assert wait_for(lambda: len(seen) > before + 3)
+        return eye
+
+    def found():
+        return [each.text for each in watch.drift(executor.statistics())
+                if each.kind == 'stopped']
+
+    with Spinning(executor):
+        eye = see()
+        assert found() == []
+        executor.remove_node(eye)
+        eye.destroy_node()
+        assert wait_for(found)
+        live = found()
+        if is_made_again:
+            see()
+            assert found() == []
+    if is_made_again:
+        assert [each.kind for each in drift_of(open_recording(path))] in ([], ['rate'])
+        return
+    recorded = [each.text for each in drift_of(open_recording(path))]
+    for text, in (live, recorded):
+        assert text.startswith('the subscription of /eye:see was destroyed ')
+    causes = replay(path).explanation.result()['causes']
+    assert causes['destroyed'] > 0 == causes['lost']
 
 
 def test_what_ran_only_before_the_begin_is_said(make_executor, make_node):

@@ -139,6 +139,21 @@ def test_a_source_that_stopped_is_named_although_its_results_were_in_time():
         assert [each.kind for each in drift(rare, seen)] == []
 
 
+@pytest.mark.parametrize(('key', 'what', 'then'), [
+    ('/a:t', 'the timer', WHEN_NEEDED), ('/b:e', 'the subscription', 'results that need it'),
+    ('/b:s', 'a subscription', 'results that need it')])
+def test_a_callback_that_was_destroyed_is_named(key, what, then):
+    """Its messages need not be missing in any count."""
+    seen = observed()
+    seen.gone = {key: 1_000 * MS}
+    assert drift(TASKS, seen) == []
+    seen.gone = {key: 1_001 * MS}
+    (found,) = drift(TASKS, seen)
+    assert (found.kind, found.callback) == ('stopped', key)
+    assert found.text.startswith(f'{what} of {key} was destroyed 1.001 s before the end')
+    assert then in found.text
+
+
 def test_of_publishers_only_those_that_always_publish_are_expected_to():
     tasks = loads("""\
 mddag: 1
