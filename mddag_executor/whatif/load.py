@@ -172,6 +172,8 @@ class LoadBuilder:
         self._note_ends()
         self._others, self._dispatch_ns = [np.empty((0, 4), dtype=np.int64)], np.empty(
             0, dtype=np.int64)
+        # places of optional messages that were published, and that no callback ran for
+        self._unheard: list[Ints] = []
         #: Callbacks that ran where nothing was recorded.
         self._elsewhere = dict[str, None]()
         #: By place of an execution that did not complete: how long it has run, ns.
@@ -445,6 +447,8 @@ class LoadBuilder:
             delays, transport = self._transports(overheads, process)
             if unsent:
                 delays[np.concatenate([each.ravel() for each in unsent])] = NEVER
+            for places in self._unheard:
+                delays[places] = NEVER - 1
         for name in ('start', 'end', 'arrived', 'sent'):    # they are large for long runs
             del self._columns[name]
         estimated = self._estimate(process, typical, unsent)
@@ -495,11 +499,16 @@ class LoadBuilder:
         for dag, publishers in enumerate(self._publishers):
             sent, arrived, end = self._of(dag, 'sent', 'arrived', 'end')
             completed = end[:, publishers] >= 0
-            first = self._tables.first_successor[self._first[dag]]
-            optional = np.array(self._tables.is_optional[first:first + len(publishers)], dtype='?')
+            optional = self._optional(dag)
             known = (sent >= 0).any(axis=0) | optional & (len(self._recording.publications) > 0)
             found.append((sent < 0) & ((arrived < 0) | optional) & completed & known)
         return found
+
+    def _optional(self, dag: int) -> Mask:
+        """Return by edge of a DAG whether its message is published only sometimes."""
+        first = self._tables.first_successor[self._first[dag]]
+        return np.array(self._tables.is_optional[first:first + len(self._publishers[dag])],
+                        dtype=np.bool_)
 
     def _never_ready(self, dag: Dag, unsent: Any) -> Any:
         """Return by job and vertex whether it cannot run, because an earlier edge is unsent."""
@@ -525,7 +534,14 @@ class LoadBuilder:
             for vertex in dag.vertices:
                 if vertex.callback.key not in typical and missing[:, vertex.index].any():
                     silent[vertex.callback.key] = None
-                    edges[:, self._edges_into[self._first[dag.index] + vertex.index]] = True
+                    into = self._edges_into[self._first[dag.index] + vertex.index]
+                    for edge in into:
+                        if self._optional(dag.index)[edge]:
+                            begin, step = (each[_EDGE, dag.index] for each in (
+                                self._begins, self._widths))
+                            self._unheard.append(
+                                begin + edge + step * np.flatnonzero(~edges[:, edge]))
+                    edges[:, into] = True
                     if vertex.index == dag.source:
                         self._skipped |= {(dag.index, row) for row in range(len(took))}
         return list(silent)

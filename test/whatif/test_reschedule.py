@@ -411,6 +411,26 @@ def test_computed_tables_know_messages_that_were_not_published(tmp_path):
     assert (sink['completed'], sink['not_due']) == (4, 6)
 
 
+@pytest.mark.parametrize('options', [{}, {'workers': 1}, {'overheads': False}])
+def test_a_message_that_is_published_sometimes_is_missed_if_its_callback_never_ran(
+        tmp_path, options):
+    """As in the recording, its result is due in the jobs in which it was published."""
+    trace = Written(tmp_path / 'run.mcap', SOMETIMES, 2)
+    for publisher, topic in ((51, '/image'), (52, '/object')):
+        trace.add('rcl_publisher_init', 0, publisher, 1, publisher, topic, 10)
+    for job, at in enumerate(range(0, 1000, 100)):
+        trace.release(0, job, at)
+        trace.run(0, 0, job, at, at + 2)
+        trace.run(0, 1, job, at + 2, at + 5)
+        if job % 3 == 0:
+            trace.add('rclcpp_publish', at + 4, 52, 0, 0, thread=10)
+    outcome = reschedule(trace.end(1000), **options)
+    computed = Replay(outcome.computed().recording(2))
+    for of in outcome.recorded.tally, outcome.tally, computed.tally:
+        sink = of.result()['dags']['/camera']['sinks']['/brake:act']
+        assert (sink['completed'], sink['overdue'], sink['not_due']) == (0, 4, 6)
+
+
 def test_paths_know_messages_that_arrived_before_their_callback_ended(tmp_path, call):
     """With two workers the next callback starts while the one that has published still runs."""
     trace = Written(tmp_path / 'run.mcap', """\
