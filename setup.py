@@ -105,6 +105,8 @@ setup(
     install_requires=[
         'argcomplete>=1.10',
         'PyYAML>=5.4',
+        # checksums of recordings; without it they take longer
+        'isal>=1.1; platform_machine in "aarch64 x86_64"',
         'lz4>=3.1',
         'mcap>=1.0',
         'numpy>=1.21',

@@ -20,7 +20,7 @@ NAME = 'mddag_executor'
 SHARE = f'share/{NAME}'
 ROS = ('ament_index_python', 'builtin_interfaces', 'diagnostic_msgs', 'launch', 'launch_ros',
        'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'rosidl_parser', 'std_msgs')
-OPTIONAL = ('distributed', 'llvmlite', 'matplotlib', 'perfetto', 'pyarrow')
+OPTIONAL = ('distributed', 'isal', 'llvmlite', 'matplotlib', 'perfetto', 'pyarrow')
 BLOCKER = """
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.machinery import PathFinder

@@ -38,6 +38,7 @@ THIRD_PARTY = {
         'distributed', 'llvmlite', 'matplotlib', 'pandas', 'pyarrow')},
     **{name: ('mcap-ros2-support', name) for name in ('lz4', 'mcap', 'zstandard')},
     'argcomplete': ('python3-argcomplete', 'argcomplete'),
+    'isal': (None, 'isal'),
     'numpy': ('python3-numpy', 'numpy'),
     'rosbags': ('python3-rosbags-pip', 'rosbags'), 'yaml': ('python3-yaml', 'PyYAML'),
 }

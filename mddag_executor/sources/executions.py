@@ -187,8 +187,7 @@ class ExecutionJoin:
         self._waiting = rows(completion)
         self._dispatches = _Dispatches()
         self._executions = Growing(EXECUTIONS, **dict.fromkeys((
-            'worker', 'ready', 'began', 'start', 'end', 'busy', 'cpu', 'message', 'order'),
-            UNKNOWN))
+            'worker', 'ready', 'start', 'end', 'busy', 'cpu', 'order'), UNKNOWN))
         self._completed = Growing(COMPLETED)
 
     def expect(self, share: float) -> None:
@@ -200,6 +199,11 @@ class ExecutionJoin:
         """Return ``executions``, and ``COMPLETED``; no events can be added afterwards."""
         self.add({}, at_end=True)
         table = self._executions.table()
+        # Only imported messages are linked, and only later pieces began before they started. So
+        # these two columns take no memory of their own.
+        table.replace('message', np.broadcast_to(np.int32(UNKNOWN), len(table)))
+        table.replace('began', table['start'].view())
+        table['began'].flags.writeable = False
         _pieces(table)
         return table, self._completed.table()
 
@@ -231,8 +235,8 @@ class ExecutionJoin:
                 np.array([dag]), np.array([vertex])))
             self._executions.more(
                 1, callback=callback, dag=dag, vertex=vertex, job=job if vertex >= 0 else UNKNOWN,
-                worker=worker, thread=thread, ready=min(max(0, ready), start), began=start,
-                start=start, end=end, busy=end - start)
+                worker=worker, thread=thread, ready=min(max(0, ready), start), start=start,
+                end=end, busy=end - start)
         return [*found.values()]
 
     def add(
@@ -262,8 +266,7 @@ class ExecutionJoin:
         table = self._executions.more(
             len(dispatch), callback=dispatch['callback'], dag=dag, vertex=vertex,
             job=dispatch['job'], worker=dispatch['worker'], thread=thread, ready=ready,
-            began=start, start=start, cpu=dispatch['cpu_time'],
-            holds_gil=dispatch['held_interpreter'])
+            start=start, cpu=dispatch['cpu_time'], holds_gil=dispatch['held_interpreter'])
         undeclared = dag < 0
         if undeclared.any():
             table['inherited'] = np.where(undeclared, dispatch['reference_deadline'], 0)
@@ -403,7 +406,9 @@ def number_pieces(table: Table, mine: Ints, of: str, goes_on: Mask) -> None:
         return
     begin = np.maximum.accumulate(np.where(same, 0, np.arange(len(mine))))
     table['piece'][mine] = np.arange(len(mine)) - begin
-    table['began'][mine] = table['start'][mine[begin]]
+    began = table['began'].copy()
+    began[mine] = table['start'][mine[begin]]
+    table.replace('began', began)
     total = np.cumsum(table['busy'][mine])
     ended = table['end'][mine] >= 0     # a running piece is the last one
     table['busy'][mine[ended]] = (total - total[begin] + table['busy'][mine[begin]])[ended]

@@ -145,7 +145,7 @@ class _Part:
             for name, columns in _TIMES.items():
                 for column in columns:
                     times = tables[name][column]
-                    times[times > 0] += self.shift
+                    tables[name].replace(column, np.where(times > 0, times + self.shift, times))
         self.last = max(self.first, int(self.seen_at.max(initial=0)), *(
             int(tables[name][column].max(initial=0))
             for name, column in _HAPPENED.items()))

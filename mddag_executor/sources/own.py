@@ -120,11 +120,6 @@ def read_own(
     with named_errors(reader.path, name):
         who = Entities(by_address=True)
         read = _Source(reader, name, head, declared(head, name), who).read(progress)
-    executions = read.tables['executions']
-    if not executions['piece'].any():
-        executions.replace('began', executions['start'])
-    # only imported messages are linked
-    executions.replace('message', np.broadcast_to(np.int32(UNKNOWN), len(executions)))
     give_back()     # events that are in no table
     return Recording(
         read.run, Columns(**read.tables), replace(

@@ -25,10 +25,10 @@ from io import BytesIO
 import os
 import struct
 from typing import BinaryIO, NamedTuple
-import zlib
 
 from mcap.opcode import Opcode
 from mddag_executor.trace import records
+from mddag_executor.trace.checksum import crc32
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.records import Channel, Content, counts_of, library_of
 import zstandard
@@ -142,7 +142,7 @@ class Block:
             raise Damage('a chunk cannot be decompressed', self.offset) from None
         except ValueError as error:
             raise Damage(str(error), self.offset) from None
-        if self.is_checked and zlib.crc32(room) != self.chunk.crc:
+        if self.is_checked and crc32(room) != self.chunk.crc:
             raise Damage('the CRC of a chunk is wrong', self.offset)
 
 
@@ -432,5 +432,5 @@ def _crc(stream: BinaryIO, start: int, end: int, rest: bytes) -> int:
         piece = stream.read(min(end - start, _CRC_PIECE))
         if not piece:
             raise ValueError(_SHORTER)
-        crc, start = zlib.crc32(piece, crc), start + len(piece)
-    return zlib.crc32(rest, crc)
+        crc, start = crc32(piece, crc), start + len(piece)
+    return crc32(rest, crc)

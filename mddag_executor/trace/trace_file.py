@@ -27,7 +27,6 @@ import os
 import struct
 from types import TracebackType
 from typing import Any
-import zlib
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -55,6 +54,7 @@ from mddag_executor.output_rules import (
     whole_file,
 )
 from mddag_executor.trace import cdr, records
+from mddag_executor.trace.checksum import crc32
 from mddag_executor.trace.errors import TraceError
 from mddag_executor.trace.groups import Group, GROUPS
 from mddag_executor.trace.schema import camel_case, EVENTS, EventType
@@ -349,7 +349,7 @@ class TraceFile:
         end = max(max(channel.index[::2]) for channel in used)
         data = b''.join(self._records)
         packed = self._zstd.compress(data)
-        chunk = written(Chunk('zstd', packed, end, start, zlib.crc32(data), len(data)))
+        chunk = written(Chunk('zstd', packed, end, start, crc32(data), len(data)))
         messages = 0
         indexes = b''
         offsets = {}
@@ -386,7 +386,7 @@ class TraceFile:
         summary_start = self._offset
         summary = self._summary()
         footer = written(Footer(summary_start, 0, 0))[:-4]
-        crc = zlib.crc32(summary + footer)      # from the summary's start to the CRC itself
+        crc = crc32(summary + footer)      # from the summary's start to the CRC itself
         self._write(summary + footer + records.UINT32.pack(crc) + records.MAGIC)
         close_recording(self._stream)
 
