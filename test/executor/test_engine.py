@@ -17,7 +17,7 @@ from mddag_executor.errors import UsageError
 from mddag_executor.executor import due as due_module
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.attribution import Origin
-from mddag_executor.executor.bounds import PATIENCE_NS
+from mddag_executor.executor.bounds import NET_NS, PATIENCE_NS
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
@@ -918,6 +918,20 @@ def test_what_a_thread_finds_waiting_when_it_looks_is_checked_for(make_executor)
         pool.running = False
 
 
+def test_the_deadline_of_what_may_hang_is_watched(make_executor):
+    """Else its miss would be known when it ends."""
+    task_set = loads(GRAPH)
+    pool = pool_of(make_executor(task_set, num_workers=2))
+    timer = entity_of(pool.engine, task_set, 0, 0, TimerLike)
+    with pool.lock:
+        pool.running = True
+        now = pool.tick()
+        pool.engine.timer_due(Work(timer, print), now, now)
+        assert pool._choose(WorkerThread(pool, None), pool.now)
+        assert pool.agenda.next == now - pool.offset + 10 * MS + 1
+        pool.running = False
+
+
 def test_a_step_can_be_woken_again_after_a_worker_has_looked(make_executor):
     """The look of a callback that has outlasted a spin takes the event that was to wake it."""
     pool = pool_of(make_executor())
@@ -942,6 +956,7 @@ def test_a_parked_thread_looks_soon_for_what_comes_during_a_short_callback(
         entities[0].wall_ns = 0
         pool.engine.ready(Work(entities[0], print), pool.tick())
         assert pool._choose(me, pool.now)
+        assert pool.parking.watch.at <= pool.now - pool.offset + NET_NS
         pool.engine.ready(Work(entities[1], print), pool.tick())
         pool.wake_for_more()
         assert pool.parking.watch.at <= pool.now - pool.offset + PATIENCE_NS
@@ -991,6 +1006,45 @@ def test_no_thread_waits_for_events_of_a_callback_that_has_gone(make_executor):
             pool._rest(other, pool.now)
             assert other.state.value == state
         pool.running = False
+
+
+def test_a_thread_is_called_to_wait_for_events_while_a_callback_computes(
+        make_executor, monkeypatch):
+    """If a callback is known to wait, which may get messages at any time."""
+    pool, calls = pool_of(make_executor(num_workers=2)), []
+    monkeypatch.setattr(pool, 'call', lambda: calls.append(1))
+    eager = new_entity(kind=Eager)
+    pool.note_eager(eager)
+    with pool.lock:
+        pool.running = True
+        for expected in (1, 0):
+            me, computes = WorkerThread(pool, None), new_entity(holds=True)
+            computes.wall_ns = 100 * MS
+            pool.engine.ready(Work(computes, print), pool.tick())
+            assert pool._choose(me, pool.now) and len(calls) == expected
+            pool.engine.finished(me.work, pool.now, pool.now, pool.now, 0, 0)
+            pool.forget_eager(eager)
+            calls.clear()
+        pool.running = False
+
+
+@pytest.mark.parametrize('wall_ns', [0, MS], ids=['past the core', 'core'])
+def test_a_message_is_freed_when_its_callback_has_ended(make_executor, wall_ns):
+    """It is kept by nothing until the next one comes."""
+    pool = pool_of(make_executor())
+    me, entity = WorkerThread(pool, None), new_entity()
+    entity.wall_ns = wall_ns
+    work = Work(entity, print)
+    with pool.lock:
+        pool.running = True
+        pool.engine.ready(work, pool.tick())
+        assert pool._choose(me, pool.now) and me.work is work
+        me.work = None
+        pool.engine.finished(work, pool.now, pool.now, pool.now, 0, 0)
+        pool.running = False
+    kept = weakref.ref(work)
+    del work
+    assert kept() is None
 
 
 def test_one_thread_is_called_until_it_has_looked(make_executor, monkeypatch):

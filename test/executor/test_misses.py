@@ -9,6 +9,7 @@ Misses are known when they happen, and what `on_deadline_miss` does never distur
 from collections import Counter
 from contextlib import suppress
 import os
+import re
 import sys
 import threading
 import time
@@ -260,6 +261,31 @@ def test_between_two_lines_of_the_log_a_miss_costs_nothing(monkeypatch, capfd):
         '1 deadline missed: sink, 1 ms, job 7 of dag',
         '3 deadlines missed within 10 s, the last: sink, 1 ms, job 7 of dag',
         '1 deadline missed within 10 s: sink, 1 ms, job 7 of dag']
+
+
+def test_misses_after_a_line_of_the_log_are_in_a_later_one(
+        make_executor, make_node, monkeypatch, capfd):
+    """Though nothing else happens until it may be written."""
+    monkeypatch.setattr(misses, 'LOG_EVERY_S', 0.3)
+    node, ran, logged = make_node('late'), [], []
+
+    def late():
+        time.sleep(0.002)
+        ran.append(1)
+        if len(ran) == 4:
+            timer.cancel()
+
+    timer = node.create_timer(0.01, late)
+    executor = make_executor(loads(graph(
+        late='name: t, timer: 10ms, dag: d, deadline: 1ms')), nodes=[node])
+
+    def n_logged():
+        logged.append(capfd.readouterr().err)
+        return sum(map(int, re.findall(r'(\d+) deadlines? missed', ''.join(logged))))
+
+    with Spinning(executor):
+        assert wait_for(lambda: len(ran) == 4)
+        assert wait_for(lambda: n_logged() == total(executor.statistics()['dags']).missed >= 4)
 
 
 def test_a_miss_in_the_last_step_is_logged(make_executor, make_node, capfd):

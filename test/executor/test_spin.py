@@ -125,6 +125,37 @@ def test_a_callback_that_outlasts_a_spin_leaves_the_next_ones_to_spin_once(make_
     assert {*ran} == {threading.get_ident()}
 
 
+def test_a_callback_that_outlasts_a_spin_leaves_what_waits_to_spin_once(make_executor):
+    """The thread of that callback runs nothing else."""
+    executor, begun, go_on, ran_in = make_executor(), [], threading.Event(), []
+
+    def outlasts():
+        begun.append(1)
+        go_on.wait(30.0)
+        for _ in range(50):
+            executor.create_task(lambda: ran_in.append(threading.current_thread()))
+
+    executor.create_task(outlasts)
+    assert wait_for(lambda: executor.spin_until_future_complete(Future(), 0.01) or begun)
+    go_on.set()
+    assert wait_for(lambda: executor.spin_once(0.1) or len(ran_in) == 50)
+    assert {*ran_in} == {threading.current_thread()}
+
+
+def test_spin_once_goes_on_when_the_only_worker_is_free_again(make_executor):
+    """A callback had outlasted the spin before it."""
+    executor, begun, go_on, ran = make_executor(num_workers=1), [], threading.Event(), []
+    executor.create_task(lambda: (begun.append(1), go_on.wait(60.0)))
+    assert wait_for(lambda: executor.spin_until_future_complete(Future(), 0.01) or begun)
+    executor.create_task(ran.append, 1)
+    step = threading.Thread(target=executor.spin_once, args=(60.0,))
+    step.start()
+    assert not wait_for(lambda: ran, 0.05)  # it waits
+    go_on.set()
+    assert wait_for(lambda: ran)
+    step.join()
+
+
 def test_a_spin_wakes_a_worker_that_did_not_leave_after_the_last_one(make_executor, monkeypatch):
     """As it was not scheduled in time, or a second interrupt ended the wait for it."""
     executor = make_executor(num_workers=1)
