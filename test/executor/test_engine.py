@@ -1047,6 +1047,27 @@ def test_a_message_is_freed_when_its_callback_has_ended(make_executor, wall_ns):
     assert kept() is None
 
 
+def test_a_thread_that_may_be_needed_soon_waits_for_events_next_to_another_one(make_executor):
+    """Its last callback has waited; but no more threads wait than workers are idle."""
+    pool = pool_of(make_executor(num_workers=3))
+    threads = [WorkerThread(pool, threading.current_thread()) for _ in range(4)]
+    with pool.lock:
+        pool.running = True
+        for thread in threads:
+            thread.is_spare = True
+            pool._rest(thread, pool.tick())
+        assert [thread.state.value for thread in threads] == 3 * ['waiting'] + ['parked']
+        pool.running = False
+
+
+def test_messages_lost_on_the_way_to_the_executor_itself_are_none_of_a_callback():
+    engine, entity = new_engine(), new_entity()
+    for is_own in (True, False):
+        entity.is_own = is_own
+        engine.messages_lost(entity, 3, 0)
+    assert entity.lost == 3
+
+
 def test_one_thread_is_called_until_it_has_looked(make_executor, monkeypatch):
     """Each further one would find nothing more to start."""
     pool, calls = pool_of(make_executor()), []

@@ -13,12 +13,12 @@ import time
 import types
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.executor import workers
+from mddag_executor.executor import lending, workers
 from mddag_executor.executor.interrupts import interruptible_sleep, InterruptsDeferred
 from mddag_executor.executor.shutdown import call_at_shutdown
 import pytest
 import rclpy
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, ShutdownException
 from rclpy.node import Node
@@ -140,6 +140,48 @@ def test_a_callback_that_outlasts_a_spin_leaves_what_waits_to_spin_once(make_exe
     go_on.set()
     assert wait_for(lambda: executor.spin_once(0.1) or len(ran_in) == 50)
     assert {*ran_in} == {threading.current_thread()}
+
+
+def test_a_step_runs_one_though_a_group_refuses_another_one(make_executor, make_node):
+    """Another executor runs a callback of that group."""
+    node, ran, group = make_node(), [], MutuallyExclusiveCallbackGroup()
+    executor = make_executor(nodes=[node])
+    guards = [node.create_guard_condition(partial(ran.append, number), callback_group=each)
+              for number, each in enumerate((group, ReentrantCallbackGroup()))]
+    executor.spin_once(0)
+    assert group.beginning_execution(guards[0])
+    for guard in guards:
+        guard.trigger()
+    executor.spin_once(10.0)
+    assert ran == [1]
+    group.ending_execution(guards[0])
+    executor.spin_once(10.0)
+    assert ran == [1, 0]
+
+
+def test_a_callback_that_waits_for_its_worker_goes_on_when_a_step_ends(
+        make_executor, monkeypatch):
+    """It has outlasted the spin before, and that step was the last one."""
+    monkeypatch.setattr(lending, 'REJOIN_NS', 3600 * 10 ** 9)
+    executor, ran, bell = make_executor(num_workers=1), [], threading.Event()
+    waiting = pool_of(executor).lending.rejoining
+
+    def lends():
+        ran.append('begins')
+        with executor.lend():
+            bell.wait(30.0)
+        ran.append('goes on')
+
+    def answers():
+        bell.set()
+        assert wait_for(lambda: waiting)
+
+    executor.create_task(lends)
+    assert wait_for(lambda: executor.spin_until_future_complete(Future(), 0.01) or ran)
+    answer = executor.create_task(answers)
+    executor.spin_once(10.0)
+    assert answer.done() and answer.exception() is None
+    assert wait_for(lambda: ran == ['begins', 'goes on'])
 
 
 def test_spin_once_goes_on_when_the_only_worker_is_free_again(make_executor):

@@ -19,6 +19,7 @@ from test_msgs.action import Fibonacci
 
 from .conftest import matched, patience, Spinning, wait_for
 from .declared import graph
+from .inside import pool_of
 
 # --- like rclpy's executor -----------------------------------------------------------------------
 
@@ -227,6 +228,29 @@ def test_a_coroutine_that_only_asks_again_and_again_takes_little_of_the_cpu(make
         assert wait_for(executor.create_task(work).done)
     # this many microseconds have passed, whatever else the machine has done
     assert len(turns) * (len(turns) - 1) // 2 <= 500_000
+
+
+def test_a_coroutine_that_has_awaited_something_rests_briefly_again(make_executor, monkeypatch):
+    executor, rests, done = make_executor(), [], Future()
+    pool = pool_of(executor)
+    call_at = pool.call_at
+
+    def note(at, function):
+        rests.append(at - time.monotonic_ns())
+        call_at(at, function)
+
+    monkeypatch.setattr(pool, 'call_at', note)
+
+    async def work():
+        for _ in range(300):
+            await Turn()
+        executor.create_task(done.set_result, None)
+        await done
+        await Turn()
+
+    with Spinning(executor):
+        assert wait_for(executor.create_task(work).done)
+    assert len(rests) == 301 and rests[-1] <= 1_000
 
 
 def fails():
