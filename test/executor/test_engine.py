@@ -1068,6 +1068,37 @@ def test_messages_lost_on_the_way_to_the_executor_itself_are_none_of_a_callback(
     assert entity.lost == 3
 
 
+def test_the_job_of_a_callback_that_is_destroyed_before_it_runs_expires():
+    task_set = loads(GRAPH)
+    engine = new_engine(task_set, 2)
+    engine.timer_due(Work(entity_of(engine, task_set, 0, 0), print), 0, 0)
+    work = engine.step(0, 0).work
+    engine.destroyed(work, MS)
+    check(engine)
+    sink = engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick']
+    assert (sink['completed'], sink['expired']) == (0, 1)
+    assert work.entity.dropped == 1 and engine.idle_workers == 2
+
+
+def test_what_runs_at_once_counts_as_undeclared():
+    engine, entity = new_engine(), new_entity()
+    engine.ran_at_once(entity)
+    engine.ready(Work(entity, print), 0)
+    assert engine.undeclared == 2 and (entity.ready, entity.ran) == (2, 1)
+
+
+def test_what_waits_for_a_callback_that_seems_to_compute_waits_half_as_long():
+    """Then it is found out whether it does."""
+    found = []
+    for holds in (False, True):
+        engine = new_engine(workers=2)
+        engine.ready(Work(new_entity(holds=holds), print), 0)
+        assert engine.step(0, 0).work
+        engine.ready(Work(new_entity(holds=True), print), 0)
+        found.append(engine.patience())
+    assert found == [PATIENCE_NS, PATIENCE_NS // 2]
+
+
 def test_one_thread_is_called_until_it_has_looked(make_executor, monkeypatch):
     """Each further one would find nothing more to start."""
     pool, calls = pool_of(make_executor()), []

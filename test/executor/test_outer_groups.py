@@ -181,3 +181,17 @@ def test_those_that_have_waited_go_on_one_after_the_other_when_the_spin_ends(
     assert ran[2:4] == ['other', 'ends'] and sorted(ran[4:]) == [
         '1 ends', '1 goes on', '2 ends', '2 goes on']
     assert [each[0] for each in ran[4:]] in (['1', '1', '2', '2'], ['2', '2', '1', '1'])
+
+
+def test_a_program_waits_for_its_own_callbacks_only(make_executor):
+    executor, go_on, counts = make_executor(num_workers=2), threading.Event(), []
+    group = executor.new_outer_group()
+    group.open(1)
+    with Spinning(executor):
+        for create in (executor.create_task, partial(executor.create_task_in, group.number)):
+            begun = threading.Event()
+            create(lambda begun=begun: (begun.set(), go_on.wait(FAR_S)))
+            assert begun.wait(FAR_S)
+            counts.append(group.n_running())
+        go_on.set()
+    assert counts == [0, 1]

@@ -184,6 +184,37 @@ def test_a_callback_that_waits_for_its_worker_goes_on_when_a_step_ends(
     assert wait_for(lambda: ran == ['begins', 'goes on'])
 
 
+def test_the_end_is_not_put_off_by_a_callback_that_waits_for_a_service(
+        make_executor, monkeypatch):
+    """The service may have ended already; but what runs is waited for."""
+    monkeypatch.setattr('mddag_executor.executor.executor._ANSWER_S', 0.05)
+    executor, begun, go_on = make_executor(num_workers=2), [], threading.Event()
+
+    def waits(lend):
+        with lend():
+            begun.append(1)
+            go_on.wait(60.0)
+
+    def is_done(seconds):
+        end = time.monotonic() + seconds
+        return executor.finish_callbacks(lambda: time.monotonic() < end)
+
+    with Spinning(executor):
+        for lend in (executor.lend, contextlib.nullcontext):
+            executor.create_task(waits, lend)
+        assert wait_for(lambda: len(begun) == 2)
+        assert not is_done(0.2)
+        go_on.set()
+        assert is_done(15.0)
+        go_on.clear()
+    executor, begun = make_executor(num_workers=2), []
+    with Spinning(executor):
+        executor.create_task(waits, executor.lend)
+        assert wait_for(lambda: begun)
+        assert is_done(patience(15.0))
+        go_on.set()
+
+
 def test_spin_once_goes_on_when_the_only_worker_is_free_again(make_executor):
     """A callback had outlasted the spin before it."""
     executor, begun, go_on, ran = make_executor(num_workers=1), [], threading.Event(), []
