@@ -124,8 +124,8 @@ def gc_paused() -> Iterator[None]:
     """
     Switch the cyclic garbage collector off.
 
-    Reading a declaration makes hundreds of thousands of objects and no garbage; the collector
-    would take a quarter of the time.
+    Reading a declaration or a recording makes hundreds of thousands of objects and no garbage;
+    the collector would take up to a quarter of the time.
     """
     was_enabled = gc.isenabled()
     gc.disable()

@@ -58,7 +58,7 @@ from msg_graph import TaskSet
 import numpy as np
 
 PARTS = DISPATCH, END, COMPLETE = ('mddag:dispatch', 'ros2:callback_end', 'mddag:complete')
-COMPLETED = np.dtype([('place', 'i8'), ('time', 'i8'), ('row', 'i8')])
+COMPLETED = np.dtype([('place', 'i8'), ('time', 'i8'), ('row', 'i4')])
 """Completions: position in the file, time, row of the execution."""
 _MOST_NESTED = 32
 """This many executions in a row may have ended while an earlier one ran in their thread."""
@@ -365,7 +365,7 @@ def unfinished_rows(
 
 def _pieces(table: Table) -> None:
     """Count the pieces of executions that were suspended (rule 5)."""
-    vertex = table['vertex'].copy()
+    vertex = table['vertex']
     suspended = np.flatnonzero((table['completes'] == NOTHING) & (vertex >= 0))
     if len(suspended):
         mine = np.flatnonzero(np.isin(vertex, vertex[suspended]))

@@ -17,6 +17,7 @@ from mddag_executor.sources.own import read_own
 from mddag_executor.sources.progress import Progress
 from mddag_executor.trace import TraceReader
 from msg_graph import EMPTY_TASK_SET, load, TaskSet
+from msg_graph.derive import gc_paused
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ Given = str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | Traces | Tra
 """A trace or its path, or the paths of the traces of all processes of one run."""
 
 
+@gc_paused()
 def open_recording(
     path: Given, task_set: TaskSet | str | os.PathLike[str] | None = None,
     name: str | None = None, progress: Progress | None = None,
