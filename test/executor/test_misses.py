@@ -188,6 +188,7 @@ def test_a_callback_that_has_ended_is_no_miss_before_its_thread_could_say_so(
                 if has_ended:
                     may_end.set()
                     assert wait_for(lambda: thread.outcome is not RUNS)
+                pool.due.overdue.update()   # as a thread does before it waits
                 pool.now += 10 ** 12        # the deadline is over
                 pool.due.overdue.come_due()
                 assert pool.engine.verdicts.missed == (not has_ended)
