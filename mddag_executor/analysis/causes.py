@@ -74,7 +74,8 @@ REMEDIES = {
     'interpreter': 'give the nodes processes of their own, or release the lock while computing',
     'group': 'give the callback a group of its own, or a reentrant one',
     'program': 'if the callbacks of its program may overlap, let them (--concurrent NODE, or a '
-               'MultiThreadedExecutor); else give the node a program of its own',
+               'MultiThreadedExecutor); else give the node a program of its own; if it spins in a '
+               'loop of its own (spin_once), spin more often, as nothing runs between two spins',
     'released late': 'look at the timer, or at the way of the message from its sensor',
     'transport': 'let the nodes share a process, or send smaller messages',
     'machine': 'free the CPUs of other work, pin the workers, or take a machine that does not '
@@ -160,7 +161,9 @@ class Pool(NamedTuple):
     :ivar threads: by thread when callbacks ran in it; None: all places are processes.
     :ivar hangs: by execution whether it never ended, and had run for ``HANGS_NS``.
     :ivar blocked: by vertex when such an execution kept its callback group busy.
-    :ivar programs: by vertex when callbacks of its program ran, if that runs one at a time.
+    :ivar programs: by vertex when callbacks of its program ran, if that runs one at a time, or
+        when nothing of its program spun.
+    :ivar gaps: by vertex when nothing in its process spun, so that no timer was noticed.
     :ivar answers: by execution whether a message of another topic than the driving one started it,
         of a driven sync.
     """
@@ -174,6 +177,7 @@ class Pool(NamedTuple):
     hangs: Mask
     blocked: dict[int, Spans]
     programs: dict[int, Spans]
+    gaps: dict[int, Spans]
     answers: Mask
 
     def within(self, kind: str, spans: Table) -> Ints:
@@ -330,6 +334,9 @@ def find(
         times[lags, WAITED] = np.minimum(
             left[lags], pool.within('full', spans[lags]))
         times[lags, RELEASED_LATE] -= times[lags, WAITED]
+    times[lags, PROGRAM] = np.minimum(
+        _overlap(spans[lags], pool.gaps), times[lags, RELEASED_LATE])
+    times[lags, RELEASED_LATE] -= times[lags, PROGRAM]
     runs = kinds == _RUN
     normal = usual.runs[spans['vertex']]
     usually = np.where(left <= normal + (normal >> _ABOUT_BITS), left, normal)

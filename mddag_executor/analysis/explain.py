@@ -169,7 +169,7 @@ class Explanation:
             {place: self._busy(rows[self._place[rows] == place], place, hangs)
              for place in places - of_threads},
             [stop for stop in self.stops if stop[1] >= first], any(self._workers.values()),
-            self._place, of_vertex, threads, hangs, blocked, self._busy_programs(),
+            self._place, of_vertex, threads, hangs, blocked, *self._busy_programs(),
             self._answers())
 
     def _hangs(self) -> tuple[Mask, dict[int, Spans]]:
@@ -191,13 +191,19 @@ class Explanation:
                        for vertex, of in self._groups.items() if of >= 0
                        and len(members := mine[group == of])}
 
-    def _busy_programs(self) -> dict[int, Spans]:
-        """Return by vertex when callbacks of its program ran, if that runs one at a time."""
-        spans = {number: Spans(*crowded(runs['start'], runs['end'], 1))
-                 for number, runs in self._recording.runs_of_programs().items()}
-        return {vertex: spans[number]
-                for vertex, number in self._by_vertex(self._who.programs).items()
-                if number in spans}
+    def _busy_programs(self) -> tuple[dict[int, Spans], dict[int, Spans]]:
+        """Return ``programs`` and ``gaps`` of ``Pool``."""
+        found: dict[int, list[tuple[Ints, Ints]]] = {}
+        gaps: dict[int, Spans] = {}
+        for program, mine, starts, ends in self._recording.closed_times():
+            vertices = distinct(self._recording.executions['vertex'][mine])
+            for vertex in vertices[vertices >= 0].tolist():
+                found.setdefault(vertex, []).append((starts, ends))
+                if program == -1:
+                    gaps[vertex] = Spans(*crowded(starts, ends, 1))
+        programs = {vertex: map(np.concatenate, zip(*times)) for vertex, times in found.items()}
+        return {vertex: Spans(*crowded(starts, ends, 1))
+                for vertex, (starts, ends) in programs.items()}, gaps
 
     def _busy(self, rows: Ints, place: int, hangs: Mask) -> Busy:
         """Return when executions occupied all workers, and when they may have held the GIL."""

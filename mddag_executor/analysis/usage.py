@@ -99,20 +99,19 @@ def group_waits(recording: Recording) -> Ints:
 
 def program_waits(recording: Recording, in_group: Ints) -> Ints:
     """
-    Return by execution how long other callbacks of its program ran while it waited, ns.
+    Return by execution how long it waited for its program, ns.
 
-    Only callbacks of programs that run their callbacks one at a time wait for them.  Time in which
-    it waited for its callback group (``in_group``) does not count a second time.
+    Other callbacks of the program ran, and it runs them one at a time, or it did not spin.  Time
+    in which it waited for its callback group (``in_group``) does not count a second time.
     """
-    table, programs = recording.executions, recording.runs_of_programs()
-    waited = np.broadcast_to(np.int64(0), len(table))   # which takes no memory
-    if not programs:
-        return waited
-    waited = waited.copy()
-    for number, runs in programs.items():
-        rows = np.flatnonzero((recording.programs_of_executions == number) & (
-            table['piece'] == 0) & (table['start'] >= 0))
-        occupied = Spans(*crowded(runs['start'], runs['end'], 1)).within(
+    table = recording.executions
+    closed = [*recording.closed_times()]
+    if not closed:
+        return np.broadcast_to(np.int64(0), len(table))     # which takes no memory
+    waited = np.zeros(len(table), dtype=np.int64)
+    for _, of_program, starts, ends in closed:
+        rows = np.flatnonzero(of_program & (table['piece'] == 0) & (table['start'] >= 0))
+        occupied = Spans(*crowded(starts, ends, 1)).within(
             table['ready'][rows], table['start'][rows])
         waited[rows] = np.maximum(0, occupied - in_group[rows])
     later, first = later_pieces(table)

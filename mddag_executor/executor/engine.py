@@ -75,6 +75,7 @@ from mddag_executor.executor.outer_places import OuterPlaces
 from mddag_executor.executor.path_watch import PathWatch
 from mddag_executor.executor.run_records import RunRecords
 from mddag_executor.executor.sent_requests import Heritage, SentRequests
+from mddag_executor.executor.spin_gaps import SpinGaps
 from mddag_executor.executor.unfinished import Unfinished
 from mddag_executor.executor.verdicts import DeadlineMiss, Record, Verdicts
 from msg_graph import TaskSet
@@ -177,7 +178,8 @@ class Engine:
         self._complete = self.scheduler.complete
         self._take = self.scheduler.take
         self._work: dict[int, Work] = {}
-        self.outer = OuterPlaces(self.scheduler, self._end_bypass, self._work)
+        self.spin_gaps = SpinGaps(record)
+        self.outer = OuterPlaces(self.scheduler, self._end_bypass, self._work, self.spin_gaps)
         self._next_job = [0] * self.tables.n_dags
         self._finished = False
         self._ended = NEVER
@@ -577,6 +579,8 @@ class Engine:
         step.n_idle = self._scalars[N_IDLE]  # nothing runs past the core any more
         if work is not None:
             step.is_short = work.entity.wall_ns <= SHORT_CALLBACK_NS
+            if work.entity.outer in self.outer.once:
+                self.outer.started(work.entity.outer, now)
         if len(self._holders) > 1:
             self.interpreter.reorder()
             if self.interpreter.pauses:
@@ -1023,6 +1027,7 @@ class Engine:
         """
         end = now if end is None else end
         self._ended = end
+        self.spin_gaps.finish(now)
         if self._records is not None:
             self._records.waiting(self._work.values(), now)
             self._records.unfinished(unfinished, now)

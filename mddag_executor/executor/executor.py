@@ -63,6 +63,7 @@ from mddag_executor.executor.shutdown import (
 )
 from mddag_executor.executor.silences import may_be_silent, Silences
 from mddag_executor.executor.sources import SubscriptionEntity
+from mddag_executor.executor.spin_gaps import EXECUTOR
 from mddag_executor.executor.statistics import statistics
 from mddag_executor.executor.tasks import make_task, TaskEntities, Unclaimed, watched
 from mddag_executor.executor.unfinished import LongRuns
@@ -502,8 +503,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._spin_deferred(done, deadline)
 
     def _spin_deferred(self, done: Callable[[], bool], deadline: float | None) -> None:
-        if not self._spinning.acquire(blocking=False):
-            raise RuntimeError('Executor is already spinning')
+        self._begin_spin()
         try:
             with short_switch_interval(), self._signals.watch():
                 self._spin_until(done, deadline)
@@ -521,9 +521,15 @@ class MultiDeadlineExecutor(BareExecutor):
             finally:
                 self._end_spin()
 
+    def _begin_spin(self) -> None:
+        if not self._spinning.acquire(blocking=False):
+            raise RuntimeError('Executor is already spinning')
+        self._engine.spin_gaps.end(EXECUTOR, self._trace_clock.now())
+
     def _end_spin(self) -> None:
         """Let another thread spin, or end the executor if ``shutdown`` could not."""
         self._ending.close()
+        self._engine.spin_gaps.begin(EXECUTOR, self._trace_clock.now())
         self._spinning.release()
         if self._must_shut_down:
             self.shutdown()
@@ -691,8 +697,7 @@ class MultiDeadlineExecutor(BareExecutor):
             self._spin_once_deferred(deadline, done)
 
     def _spin_once_deferred(self, deadline: float | None, done: Callable[[], bool]) -> None:
-        if not self._spinning.acquire(blocking=False):
-            raise RuntimeError('Executor is already spinning')
+        self._begin_spin()
         try:
             with self._pool.in_spin_once(), self._signals.watch():
                 while not self.is_ending():

@@ -67,11 +67,11 @@ class OuterGroup:
     def _apply(self) -> bool:
         """Tell the core; return whether a callback may start now.  The caller holds the lock."""
         pool = self._pool
-        pool.tick()
+        now = pool.tick()
         limit, once = self._limit, self._once
         if self.n_nested:
             limit, once = max(1, limit), False
-        may_start = pool.engine.outer.open(self.number, limit, once)
+        may_start = pool.engine.outer.open(self.number, limit, now, once)
         if limit:
             pool.wake_for_more()
         return may_start

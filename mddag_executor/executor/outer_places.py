@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from mddag_executor.core import Scheduler
 from mddag_executor.core.queues import first_of, has_place
 from mddag_executor.executor.entity import Entity
+from mddag_executor.executor.spin_gaps import SpinGaps
 
 if TYPE_CHECKING:
     from mddag_executor.executor.work import Work
@@ -21,21 +22,29 @@ class OuterPlaces:
 
     :param end_bypass: lets the core know of all executions.
     :param works: the executions that wait, by their numbers in the core.
+    :ivar once: those that close when the next of their executions starts.
     :ivar new: adds an outer group, which is closed, and returns its number.
-    :ivar free: lets the number of an outer group without callbacks be used again.
     """
 
     def __init__(
-        self, scheduler: Scheduler, end_bypass: Callable[[], object], works: Mapping[int, Work]
+        self, scheduler: Scheduler, end_bypass: Callable[[], object], works: Mapping[int, Work],
+        gaps: SpinGaps,
     ) -> None:
         self._scheduler = scheduler
         self._state = scheduler.state
         self._end_bypass = end_bypass
         self._works = works
+        self._gaps = gaps
+        self.once: set[int] = set()
         self.new = scheduler.new_outer_group
-        self.free = scheduler.free_outer_group
 
-    def open(self, outer: int, limit: int, once: bool = False) -> bool:
+    def free(self, outer: int) -> None:
+        """Let the number of an outer group without callbacks be used again."""
+        self._gaps.end(outer, 0)
+        self.once.discard(outer)
+        self._scheduler.free_outer_group(outer)
+
+    def open(self, outer: int, limit: int, now: int, once: bool = False) -> bool:
         """
         Set how many executions of an outer group may run at a time.
 
@@ -44,11 +53,18 @@ class OuterPlaces:
         """
         self._end_bypass()
         self._scheduler.open_outer(outer, limit, once)
+        (self.once.add if once and limit else self.once.discard)(outer)
+        (self._gaps.end if limit else self._gaps.begin)(outer, now)
         state = self._state
         return any(
             state.x_outer[first_of(state, entry)] == outer and has_place(
                 state, first_of(state, entry))
             for heap in (state.ready, state.deferred) for entry in heap)
+
+    def started(self, outer: int, now: int) -> None:
+        """Note that an execution has started of an outer group that this closes."""
+        self.once.discard(outer)
+        self._gaps.begin(outer, now)
 
     def is_open(self, outer: int) -> bool:
         """Return whether executions of it may start, and will still when one has started."""

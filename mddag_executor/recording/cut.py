@@ -67,11 +67,13 @@ def part(
     takes['execution'] = executions.new(takes['execution'])
     takes['message'] = messages.new(takes['message'])
     stops, drops, demotions = columns.stops, columns.drops, columns.demotions
+    gaps = columns.spin_gaps
     losses, unfinished = columns.losses, columns.unfinished
     return Columns(
         releases=released[seen[jobs.places(released)]], executions=table,
         publications=sent, takes=takes, job_ends=ends[seen[jobs.places(ends)]],
         stops=stops[(stops['start'] < last) & (stops['end'] > begin)],
+        spin_gaps=gaps[(gaps['start'] < last) & (gaps['end'] > begin)],
         drops=drops[(drops['time'] >= begin) & (drops['time'] < last)],
         losses=losses[(losses['time'] >= begin) & (losses['time'] < last)],
         demotions=demotions[(demotions['time'] >= begin) & (demotions['time'] < last)],

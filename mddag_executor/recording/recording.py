@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -13,7 +14,7 @@ from mddag_executor.core import NEVER
 from mddag_executor.recording import cut, frames
 from mddag_executor.recording.columns import Ints, Mask, Places, Table
 from mddag_executor.recording.head import ReplayError
-from mddag_executor.recording.joins import different
+from mddag_executor.recording.joins import different, distinct
 from mddag_executor.recording.losses import Losses
 from mddag_executor.recording.names import Names
 from mddag_executor.recording.recorded_jobs import Jobs
@@ -91,6 +92,11 @@ class Recording:
     def stops(self) -> Table:
         """Return when the machine or process stood still."""
         return self.columns.stops
+
+    @property
+    def spin_gaps(self) -> Table:
+        """Return when a program, or (program -1) the executor of a process, did not spin."""
+        return self.columns.spin_gaps
 
     @property
     def takes(self) -> Table:
@@ -198,6 +204,26 @@ class Recording:
             mine = mine[mine['start'].argsort(kind='stable')]
             found[number] = mine[np.r_[mine['start'][1:] >= mine['end'][:-1], True]]
         return found
+
+    def closed_times(self) -> Iterator[tuple[int, Mask, Ints, Ints]]:
+        """
+        Yield programs, their executions, and starts and ends of what kept these waiting.
+
+        That is: executions of a program that runs one callback at a time, and the gaps between its
+        spins; and the gaps between the spins of the executor of a process (program -1).
+        """
+        runs, gaps, program = self.runs_of_programs(), self.spin_gaps, (
+            self.programs_of_executions)
+        numbers = {*runs, *distinct(gaps['program']).tolist()} - {-1}
+        for number in sorted(numbers):
+            mine = gaps[gaps['program'] == number]
+            ran = runs.get(number, self.executions[:0])
+            yield number, program == number, *(
+                np.r_[ran[name], mine[name]] for name in ('start', 'end'))
+        gaps = gaps[gaps['program'] == -1]
+        for process in distinct(gaps['process']).tolist():
+            mine = gaps[gaps['process'] == process]
+            yield -1, self.executions['process'] == process, mine['start'], mine['end']
 
     def exclusive_groups(self) -> dict[int, int]:
         """

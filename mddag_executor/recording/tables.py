@@ -69,11 +69,12 @@ LOSSES = _table(process='i2', callback='i8', time='i8', count='i8')
 DEMOTIONS = _table(process='i2', dag='i4', vertex='i4', job='i8', time='i8')
 MISSES = _table(dag='i4', vertex='i4', job='i8', deadline='i8', completed='i8')
 STOPS = _table(process='i2', start='i8', end='i8')
+SPIN_GAPS = _table(process='i2', program='i4', start='i8', end='i8')
 UNFINISHED = _table(process='i2', callback='i8', start='i8', where='i2')
 
 TABLES = {
     'releases': RELEASES, 'executions': EXECUTIONS, 'publications': PUBLICATIONS,
-    'job_ends': JOB_ENDS, 'stops': STOPS, 'takes': TAKES, 'drops': DROPS,
+    'job_ends': JOB_ENDS, 'stops': STOPS, 'spin_gaps': SPIN_GAPS, 'takes': TAKES, 'drops': DROPS,
     'losses': LOSSES, 'demotions': DEMOTIONS, 'misses': MISSES, 'unfinished': UNFINISHED}
 """The tables of a recording with the types of their columns."""
 
@@ -91,6 +92,7 @@ class Columns:
     publications: Table = _empty('publications')
     job_ends: Table = _empty('job_ends')
     stops: Table = _empty('stops')
+    spin_gaps: Table = _empty('spin_gaps')
     takes: Table = _empty('takes')
     drops: Table = _empty('drops')
     losses: Table = _empty('losses')

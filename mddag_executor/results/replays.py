@@ -35,7 +35,10 @@ class ResponseParts(TypedDict):
     waiting_group_ns: int
     """Part of `waiting_ns`: another callback of the group ran."""
     waiting_program_ns: int
-    """Part of `waiting_ns`: another callback of a program ran that runs one at a time."""
+    """
+    Part of `waiting_ns`: another callback of a program ran that runs one at a time, or the program
+    did not spin.
+    """
 
 
 class ChainLink(TypedDict):
@@ -55,7 +58,8 @@ class ChainLink(TypedDict):
     """How long other callbacks of its group ran while it waited; null if it did not complete."""
     waiting_program_ns: int | None
     """
-    How long other callbacks of its program, which runs one at a time, ran while it waited.
+    How long other callbacks of its program, which runs one at a time, ran while it waited, or the
+    program did not spin.
 
     Null if it did not complete.
     """
@@ -139,7 +143,10 @@ class CallbackUse(MeasuredUse):
     waiting_group_ns: int
     """Part of `waiting_ns`: another callback of its group ran."""
     waiting_program_ns: int
-    """Part of `waiting_ns`: another callback of its program ran, which runs one at a time."""
+    """
+    Part of `waiting_ns`: another callback of its program ran, which runs one at a time, or the
+    program did not spin.
+    """
 
 
 class OverTime(TypedDict):

@@ -273,6 +273,10 @@ class Entities:
 
     # --- looking up ------------------------------------------------------------------------------
 
+    def program(self, pid: int, number: int) -> int:
+        """Return the number in tables of a program that a process numbers itself; -1: none."""
+        return self._programs.get((pid, number), -1)
+
     def callback(self, pid: int, address: int, time: int) -> Callback:
         """Return the callback that an event at run time means; create an unknown one if needed."""
         found = self.callbacks.latest(pid, address, time)

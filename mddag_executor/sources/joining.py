@@ -66,7 +66,8 @@ _TIMES = {
     'executions': ('ready', 'began', 'start', 'end', 'inherited'),
     'publications': ('time', 'source_timestamp'), 'job_ends': ('time',),
     'drops': ('time',), 'losses': ('time',), 'demotions': ('time',),
-    'misses': ('deadline', 'completed'), 'stops': ('start', 'end'), 'unfinished': ('start',)}
+    'misses': ('deadline', 'completed'), 'stops': ('start', 'end'), 'unfinished': ('start',),
+    'spin_gaps': ('start', 'end')}
 _HAPPENED = {
     'releases': 'noticed', 'executions': 'end', 'publications': 'time', 'job_ends': 'time',
     'drops': 'time', 'demotions': 'time', 'stops': 'end'}

@@ -43,6 +43,7 @@ from mddag_executor.recording.tables import (
     OUTDATED,
     PUBLICATIONS,
     RELEASES,
+    SPIN_GAPS,
     STOPS,
     TAKES,
     UNKNOWN,
@@ -79,11 +80,12 @@ import numpy as np
 _INIT, _PUBLISH, _RELEASE = (
     'ros2_caret:caret_init', 'ros2:rclcpp_publish', 'mddag:job_release')
 (_DEADLINE, _DEMOTE, _FAIL, _EXPIRE, _ABORT, _OUTDATE, _LOST, _STOP, _DROP, _HOSTED, _SHUTDOWN,
- _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP, _ON_BEHALF) = (
+ _JUDGE_FROM, _MESSAGES_LOST, _UNFINISHED, _CLOCK_STEP, _ON_BEHALF, _SPIN_GAP) = (
     f'mddag:{name}' for name in (
         'deadline', 'demote', 'fail', 'expire', 'abort', 'outdate', 'lost', 'stop', 'drop',
         'hosted', 'shutdown', 'judge_from', 'messages_lost', 'unfinished',
-        'clock_step', 'on_behalf'))
+        'clock_step', 'on_behalf', 'spin_gap'))
+_PROGRAM = 'mddag:program'
 _FIELDS = {
     DISPATCH: 'vtid callback dag vertex job worker ready reference_deadline cpu_time '
               'held_interpreter',
@@ -93,6 +95,7 @@ _FIELDS = {
     _DEADLINE: 'dag vertex job deadline completed', _DEMOTE: 'dag vertex job',
     _FAIL: 'dag vertex job', _EXPIRE: 'dag job', _ABORT: 'dag job', _OUTDATE: 'dag job',
     _LOST: 'count', _CLOCK_STEP: 'step', _MESSAGES_LOST: 'callback count', _STOP: 'begin end',
+    _SPIN_GAP: 'program begin end',
     _ON_BEHALF: 'vtid callback job ready',
     _JUDGE_FROM: 'release', _SHUTDOWN: 'end'}
 """The used fields of events that have only numbers."""
@@ -290,8 +293,21 @@ class _Source:
         return Read(run, {
             'releases': releases, 'executions': executions, 'publications': publications,
             'job_ends': job_ends, 'misses': misses, 'demotions': demotions, 'losses': losses,
-            'stops': stops, 'drops': drops, 'takes': rows(TAKES), 'unfinished': unfinished},
+            'stops': stops, 'spin_gaps': self._spin_gaps(), 'drops': drops,
+            'takes': rows(TAKES), 'unfinished': unfinished},
             reasons, places, lost, self._doubts(), times[in_order], stated)
+
+    def _spin_gaps(self) -> Table:
+        """Return when the executor (-1) or a program did not spin; without unknown programs."""
+        found = self._pop(_SPIN_GAP)
+        numbers = {-1: -1} | {
+            event[5]: self._who.program(event[2], event[5])
+            for _, event in self._others if event[0] == _PROGRAM}
+        program = np.array([numbers.get(each, UNKNOWN - 1)
+                            for each in found['program'].tolist()], dtype=np.int64)
+        known = program >= -1
+        return rows(SPIN_GAPS, int(known.sum()), program=program[known],
+                    start=found['begin'][known], end=found['end'][known])
 
     def _stated(self) -> Stated:
         """Return what the process says about itself."""

@@ -45,7 +45,7 @@ from mddag_executor.recording.columns import concatenate, Ints, Mask, rows, Tabl
 from mddag_executor.recording.joins import as_of, distinct, rows_by, sort_by
 from mddag_executor.recording.losses import Loss
 from mddag_executor.recording.recording import Recording
-from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, UNKNOWN
+from mddag_executor.recording.tables import DROPS, LOSSES, NOTHING, SPIN_GAPS, UNKNOWN
 from mddag_executor.sources.entities import Entities, INIT_EVENTS, signed
 from mddag_executor.sources.executions import number_pieces
 from mddag_executor.sources.head import no_end, steps
@@ -68,8 +68,9 @@ from mddag_executor.sources.stamps import find_stamps, Sent
 from mddag_executor.trace.times import NEVER
 import numpy as np
 
-_DROP, _MESSAGES_LOST, _UNFINISHED, CLOCK_STEP = (
-    'mddag:drop', 'mddag:messages_lost', 'mddag:unfinished', 'mddag:clock_step')
+_DROP, _MESSAGES_LOST, _UNFINISHED, CLOCK_STEP, _SPIN_GAP = (
+    'mddag:drop', 'mddag:messages_lost', 'mddag:unfinished', 'mddag:clock_step',
+    'mddag:spin_gap')
 # A timer is noticed shortly after its release within both: a time, and a part of its period.
 _SOON_NS, _SOON_PART = 1_000_000, 10
 # One in this many releases may exclude the origin of the grid, and one has to exclude others.
@@ -231,7 +232,7 @@ class UndeclaredRun(ImportedRun):
     """A run of this executor that was recorded without a declaration."""
 
     kinds = OWN_KINDS
-    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED, CLOCK_STEP)
+    others = (*INIT_EVENTS, _DROP, _MESSAGES_LOST, _UNFINISHED, CLOCK_STEP, _SPIN_GAP)
     links_type: type[OwnLinks] = OwnLinks
     links: OwnLinks
     lost = '{} lost while recording', 'event'
@@ -347,10 +348,24 @@ class UndeclaredRun(ImportedRun):
         of, callbacks, times, count = zip(*losses) if losses else ((), (), (), ())
         lost = rows(LOSSES, len(losses), process=of, callback=callbacks, time=times, count=count)
         return replace(
-            found, columns=replace(found.columns, drops=dropped, losses=lost),
+            found, columns=replace(
+                found.columns, drops=dropped, losses=lost, spin_gaps=self._spin_gaps()),
             names=replace(found.names, drop_reasons=tuple(reasons)),
             run=replace(found.run, shut_down=bool(
                 (self._events.table['kind'] == SHUTDOWN).any())))
+
+    def _spin_gaps(self) -> Table:
+        gaps = []
+        for event in self._events.others:
+            if event[0].name != _SPIN_GAP or not all(isinstance(each, int) for each in event[4:]):
+                continue
+            _, time, pid, _, program, start, end = event    # its time may have been moved
+            number = program if program == -1 else self.who.program(pid, program)
+            if program == -1 or number >= 0:
+                gaps.append((
+                    self._process.get(pid, UNKNOWN), number, time - (end - start), time))
+        process, program, start, end = zip(*gaps) if gaps else ((),) * 4
+        return rows(SPIN_GAPS, len(gaps), process=process, program=program, start=start, end=end)
 
     def _judged_until(self) -> int:
         table = self._events.table

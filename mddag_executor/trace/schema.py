@@ -153,6 +153,8 @@ _ALL = (
     _event('mddag', 'hosted', dag=_I32, vertices=_STR),
     # the callback is of a program that runs its callbacks one at a time; the number of the program
     _event('mddag', 'program', callback=_U64, program=_I64),
+    # the program, or with -1 the executor, did not spin meanwhile, so no callback of it started
+    _event('mddag', 'spin_gap', program=_I64, begin=_I64, end=_I64),
     # the timer, subscription or service of the callback was destroyed, or left the executor
     _event('mddag', 'gone', callback=_U64),
     _event('mddag', 'judge_from', release=_I64),

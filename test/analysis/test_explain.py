@@ -39,6 +39,10 @@ PLANS = {
     'group': {'wait': 25, 'others': 2, 'workers': 6, 'grouped': True},
     'program': {'wait': 25, 'took': 1, 'others': 2, 'workers': 6, 'holds': True,
                 'in_program': True},
+    # a loop of `spin_once` does something else: the program, the executor; a timer meanwhile
+    'program, loop': {'wait': 25, 'gap': 3, 'in_program': True},
+    'program, executor': {'wait': 25, 'gap': -1},
+    'program, timer': {'lag': 25, 'gap': -1},
     'interpreter': {'wait': 25, 'others': 1, 'workers': 6, 'holds': True},
     'released late': {'lag': 15},
     # the message that comes first is only kept
@@ -54,12 +58,13 @@ PLANS = {
 
 
 def record(trace, job, lag=0, way=0, wait=0, took=2, cpu=None, others=0, holds=False, stops=False,
-           ends=None):
+           ends=None, gap=None):
     """
     Record a job of the victim, in ms.
 
     It is noticed late by `lag`, its message is under way for `way`, its callback waits and takes
     so long, of which `cpu` is CPU time; meanwhile others run, or nothing does; `ends` is its end.
+    The program `gap` does not spin while it is waited for.
     """
     at = job * 50
     trace.release(0, job, at, noticed=at + lag)
@@ -70,6 +75,9 @@ def record(trace, job, lag=0, way=0, wait=0, took=2, cpu=None, others=0, holds=F
         trace.release(dag, job, at)
         trace.run(dag, 0, job, ready, max(start, end - 1), worker=dag - 1,
                   computed=(25 * MS, holds))
+    if gap is not None:
+        begin, until = (ready, start) if wait else (at, at + lag)
+        trace.add('spin_gap', until, gap, ns(begin), ns(until))
     if stops:
         trace.add('stop', start, ns(ready), ns(start))
     if ends == 'expire':
@@ -127,7 +135,7 @@ def test_the_right_cause_is_told(cause, tmp_path):
         usage = outcome.usage.callbacks()['/victim:use']
         worst = outcome.result()['dags']['/sensor']['sinks']['/victim:use']['breakdown']['worst']
         for name in ('group', 'program'):
-            expected = 25 * MS if name == cause else 0
+            expected = 25 * MS if name == cause and special != 'timer' else 0
             assert (usage[f'waiting_{name}_ns'], worst[f'waiting_{name}_ns']) == (
                 expected * JOBS // 5, expected)
     if cause in ('waited', 'group', 'program', 'interpreter') and not special:

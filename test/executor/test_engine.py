@@ -1269,7 +1269,7 @@ def test_no_message_bypasses_a_program_whose_callbacks_all_wait_for_responses(de
     engine = new_engine(workers=3)
     engine.allow_bypass()
     outer = engine.outer.new()
-    engine.outer.open(outer, 2)
+    engine.outer.open(outer, 2, 0)
     calling, entity, other = new_entity(), new_entity(depth=depth), new_entity()
     calling.outer = entity.outer = outer
     calling.wall_ns = entity.wall_ns = other.wall_ns = 0

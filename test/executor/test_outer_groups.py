@@ -2,16 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """A host opens and closes the callbacks of a program, and limits how many run at a time."""
 
+import contextlib
 from functools import partial
 import threading
 import time
 
+from mddag_executor import open_recording
 from mddag_executor.executor import lending
+from msg_graph import loads
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 
 from .conftest import matched, Spinning, wait_for
+from .declared import graph
 from .inside import pool_of
 
 FAR_S = 15.0
@@ -62,6 +66,41 @@ def test_a_step_runs_one(make_executor):
                 assert wait_for(executor.create_task(lambda: None).done)
             assert ran == [*range(count)]
     executor.shutdown()
+
+
+@pytest.mark.parametrize('is_declared', [False, True])
+@pytest.mark.parametrize('of_program', [False, True])
+def test_the_times_between_spins_are_recorded(
+        make_executor, make_node, tmp_path, of_program, is_declared):
+    """Nothing starts then, whatever waits, and a program that turns too seldom should know it."""
+    path, node, ran = tmp_path / 'run.mcap', make_node(), []
+    node.create_timer(0.01, lambda: ran.append(1))
+    text = graph(node='name: timer, timer: 10ms, deadline: 10ms')
+    executor = make_executor(
+        loads(text) if is_declared else None, num_workers=2, nodes=[node], trace=path)
+    if of_program:
+        group = executor.new_outer_group(True)
+        executor.put(node, group)
+
+    def turn():
+        before = len(ran)
+        if not of_program:
+            executor.spin_once()
+        else:
+            group.open(1, once=True)
+            assert wait_for(lambda: len(ran) > before)
+        time.sleep(0.03)
+
+    with contextlib.ExitStack() as stack:
+        if of_program:
+            stack.enter_context(Spinning(executor))
+        for _ in range(4):
+            turn()
+    executor.shutdown()
+    gaps = open_recording(path).spin_gaps
+    gaps = gaps[gaps['program'] == (0 if of_program else -1)]
+    assert len(gaps) >= 3 and (gaps['end'][:3] - gaps['start'][:3] >= 30_000_000).all()
+    assert (gaps['start'][1:] >= gaps['end'][:-1]).all()
 
 
 def test_what_waits_moves_with_its_node(make_executor, make_node):

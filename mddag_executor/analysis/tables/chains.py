@@ -33,6 +33,6 @@ TABLE = ResultTable('chains', 'callback on the critical chain of each verdict', 
     'busy': Column('how long it ran, without the waiting of a coroutine', 'ns', unknown=-1),
     'waiting_group': Column('how long others of its group ran while it waited', 'ns'),
     'waiting_program': Column('how long others of its program, which runs one at a time, ran '
-                              'while it waited', 'ns'),
+                              'while it waited, or the program did not spin', 'ns'),
     'cpu': Column('its CPU time, if it was recorded', 'ns', unknown=-1),
     'execution': Column('row of `executions`')}, _make)

@@ -27,4 +27,4 @@ TABLE = ResultTable('response_parts', 'completed job at each sink: where its res
     'unknown': Column('before the first callback of the chain that is recorded', 'ns'),
     'waiting_group': Column('part of `waiting`: another callback of the group ran', 'ns'),
     'waiting_program': Column('part of `waiting`: another callback of a program ran that runs one '
-                              'at a time', 'ns')}, _make)
+                              'at a time, or the program did not spin', 'ns')}, _make)

@@ -24,7 +24,7 @@ TABLE = ResultTable('usage', 'declared callback; the last row is for all undecla
     'longest_wait': Column('the longest such time', 'ns'),
     'waiting_group': Column('part of `waiting`: another callback of its group ran', 'ns'),
     'waiting_program': Column('part of `waiting`: another callback of its program ran, which runs '
-                              'one at a time', 'ns'),
+                              'one at a time, or the program did not spin', 'ns'),
     'measured': Column('executions of which the CPU time is known'),
     'measured_busy': Column('how long these ran', 'ns'),
     'cpu': Column('their CPU time', 'ns'),
