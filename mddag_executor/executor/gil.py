@@ -253,7 +253,8 @@ class Measurement:
             self._habit.took(own, wall)
             waited = self._cpu_wait
             self._habit.learn(
-                wall - (waited or 0), own, process - own, preempted > 0 and waited is None)
+                max(own, wall - (waited or 0)), own, process - own,
+                preempted > 0 and waited is None)
         return own
 
 

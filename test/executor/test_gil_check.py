@@ -270,3 +270,12 @@ def test_preemptions_do_not_hide_whether_a_callback_holds_the_gil(
             body()
             measurement.end()
     assert (habit.is_known, habit.holds) == (True, holds)
+    assert 0 <= habit.share <= 1
+
+
+def test_a_thread_that_waited_for_a_cpu_all_the_time_has_computed_in_the_rest(monkeypatch):
+    """The kernel counts that a little earlier or later than the times around it are read."""
+    monkeypatch.setattr(gil, 'cpu_wait_ns', count(0, 1_000_000 * MS).__next__)
+    habit = GilHabit()
+    Measurement(habit).end()
+    assert (habit.is_known, habit.holds, habit.share) == (True, 1, 1.0)
