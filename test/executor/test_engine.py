@@ -766,7 +766,7 @@ def test_how_long_something_has_waited_for_its_program_counts_from_the_first_tim
     task_set = loads(GRAPH)
     engine = new_engine(task_set, 2)
     outer = engine.outer.new()
-    engine.outer.open(outer, 1)
+    engine.outer.open(outer, 1, 0)
     first, patient, urgent = new_entity(), new_entity(), entity_of(engine, task_set, 0, 0)
     for each in (first, patient, urgent):
         each.outer = outer
