@@ -121,7 +121,7 @@ class Lending:
         if measurement is not None:
             measurement.pause()
         before = me.waits, me.waits_for
-        me.waits, me.waits_for = me.is_out, waits_for
+        me.waits, me.waits_for = True, waits_for
         try:
             executor = pool.executor if me.thread is None else None
             with nullcontext() if executor is None else executor.serve_meanwhile():

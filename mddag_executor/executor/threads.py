@@ -106,7 +106,7 @@ class WorkerThread:
     :ivar permit: a lock, released to let its callback go on.
     :ivar has_lent: whether its callback has lent its worker at any time.
     :ivar is_out: whether its callback has no worker now.
-    :ivar waits: whether it still waits for the answer for which it lent its worker.
+    :ivar waits: whether its callback waits inside ``Client.call``, or spins.
     :ivar waits_for: what it waits for then; empty: it does not wait, or that is unknown.
     :ivar measurement: of its running callback; None: it is not measured.
     :ivar paused_ns: for how long the running callback has paused.

@@ -7,6 +7,7 @@ import resource
 import threading
 
 from builtin_interfaces.msg import Time
+from mddag_executor.executor import lending
 from mddag_executor.executor.bounds import MOST
 from mddag_executor.executor.loop import MOST_DESCRIPTORS, raise_limit
 from mddag_executor.executor.sources import SERVICE_DEPTH
@@ -190,6 +191,29 @@ def test_blocked_calls_take_a_bounded_number_of_threads(make_executor, make_node
         # and the next ones find their threads
         again = asking.create_task(lambda: 'fine')
         assert wait_for(again.done)
+    assert wait_for(lambda: worker_threads() == 0)
+
+
+def test_the_end_waits_for_no_blocked_call_though_it_has_kept_its_worker(
+        make_executor, monkeypatch):
+    """No thread would handle its answer any more."""
+    monkeypatch.setattr(lending, 'MOST', 1)
+    executor, begun, go_on = make_executor(num_workers=2), [], threading.Event()
+
+    def waits():
+        with executor.lend():
+            begun.append(1)
+            go_on.wait(60.0)
+
+    try:
+        with Spinning(executor):
+            for _ in range(2):
+                executor.create_task(waits)
+            assert wait_for(lambda: len(begun) == 2)
+            assert executor.statistics()['lent'] == 1
+            assert executor.shutdown(20.0)
+    finally:
+        go_on.set()
     assert wait_for(lambda: worker_threads() == 0)
 
 

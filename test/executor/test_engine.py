@@ -17,14 +17,14 @@ from mddag_executor.errors import UsageError
 from mddag_executor.executor import due as due_module
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.attribution import Origin
-from mddag_executor.executor.bounds import NET_NS, PATIENCE_NS
+from mddag_executor.executor.bounds import NET_NS, PATIENCE_NS, REPORT_NS
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.gil_check import CHECK_PART, GilCheck
 from mddag_executor.executor.holder_check import HolderCheck
-from mddag_executor.executor.threads import WorkerThread
+from mddag_executor.executor.threads import RUNS, WorkerThread
 from mddag_executor.executor.work import current, Work
 from msg_graph import loads
 import pytest
@@ -1012,11 +1012,11 @@ def test_a_thread_is_called_to_wait_for_events_while_a_callback_computes(
         make_executor, monkeypatch):
     """If a callback is known to wait, which may get messages at any time."""
     pool, calls = pool_of(make_executor(num_workers=2)), []
-    monkeypatch.setattr(pool, 'call', lambda: calls.append(1))
+    monkeypatch.setattr(pool.parking, 'call', lambda: calls.append(1))
     eager = new_entity(kind=Eager)
     pool.note_eager(eager)
     with pool.lock:
-        pool.running = True
+        pool.running, pool._n_parked = True, 1
         for expected in (1, 0):
             me, computes = WorkerThread(pool, None), new_entity(holds=True)
             computes.wall_ns = 100 * MS
@@ -1025,7 +1025,7 @@ def test_a_thread_is_called_to_wait_for_events_while_a_callback_computes(
             pool.engine.finished(me.work, pool.now, pool.now, pool.now, 0, 0)
             pool.forget_eager(eager)
             calls.clear()
-        pool.running = False
+        pool.running, pool._n_parked = False, 0
 
 
 @pytest.mark.parametrize('wall_ns', [0, MS], ids=['past the core', 'core'])
@@ -1078,6 +1078,40 @@ def test_the_job_of_a_callback_that_is_destroyed_before_it_runs_expires():
     sink = engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick']
     assert (sink['completed'], sink['expired']) == (0, 1)
     assert work.entity.dropped == 1 and engine.idle_workers == 2
+
+
+def test_what_comes_to_a_destroyed_callback_inherits_nothing():
+    """Nor does any other execution instead of it."""
+    engine, gone, other = new_engine(), new_entity(), Work(new_entity(), print)
+    engine.ready(other, 0)
+    engine.remove(gone, 0)
+    request = Work(gone, print)
+    request.heritage = 1, 0
+    engine.posted(request, 0)
+    check(engine)
+    assert engine.step(0, 0).work is other and engine.heritage(other) is None
+
+
+def test_a_callback_that_is_just_reported_is_asked_again_soon_whether_it_is_overdue(
+        make_executor):
+    """If it is not about to end but to begin, it may hang."""
+    task_set = loads(GRAPH)
+    pool = pool_of(make_executor(task_set, num_workers=2))
+    timer, me = entity_of(pool.engine, task_set, 0, 0, TimerLike), WorkerThread(pool, None)
+    with pool.lock:
+        pool.running = True
+        pool._visitors.append(me)
+        release = pool.tick() - 20 * MS
+        pool.engine.timer_due(Work(timer, print), release, release)
+        assert pool._choose(me, pool.now)
+        pool.due.overdue.come_due()
+        assert pool.agenda.next == pool.now - pool.offset + REPORT_NS
+        me.outcome = RUNS
+        pool.due.overdue.come_due()
+        sink = pool.engine.verdicts.tally.result()['dags']['/n']['sinks']['/n:tick']
+        assert sink['overdue'] == 1
+        pool.running = False
+        pool._visitors.remove(me)
 
 
 def test_what_runs_at_once_counts_as_undeclared():

@@ -234,3 +234,33 @@ def test_a_program_waits_for_its_own_callbacks_only(make_executor):
             counts.append(group.n_running())
         go_on.set()
     assert counts == [0, 1]
+
+
+def test_a_callback_does_not_wait_for_ever_for_one_of_its_program_that_waits_for_it(
+        make_executor, monkeypatch):
+    """After some seconds they overlap."""
+    monkeypatch.setattr(lending, 'ALONE_NS', 50_000_000)
+    monkeypatch.setattr(lending, 'REJOIN_NS', 1_000_000)
+    executor, ran = make_executor(num_workers=2), []
+    answer, has_gone_on = threading.Event(), threading.Event()
+
+    def asks():
+        ran.append('asks')
+        with executor.lend():
+            answer.wait(FAR_S)
+        has_gone_on.set()
+
+    def other():
+        ran.append('other')
+        answer.set()
+        assert has_gone_on.wait(4 * FAR_S)
+
+    group = executor.new_outer_group(is_single=True)
+    group.open(1)
+    with Spinning(executor):
+        tasks = []
+        for number, what in enumerate((asks, other), 1):
+            tasks.append(executor.create_task_in(group.number, what))
+            assert wait_for(lambda number=number: len(ran) == number)
+        assert wait_for(has_gone_on.is_set)
+        assert wait_for(lambda: all(task.done() for task in tasks))

@@ -8,10 +8,12 @@ import os
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 from mddag_executor.executor import compat
 from mddag_executor.executor.listeners import ListenerError
 from mddag_executor.executor.waitables import EventsSource, WaitableSource
+from mddag_executor.executor.work import Work
 import pytest
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -476,3 +478,22 @@ def test_a_waitable_that_fails_again_and_again_is_raised_by_each_spin_once(
     with suppress(ValueError):
         executor.spin_until_future_complete(Future(), 0.1)
     executor.spin_until_future_complete(Future(), 0.1)
+
+
+def test_a_response_is_posted_once_when_its_request_has_been_noted(monkeypatch):
+    """What was found with it does not wait."""
+    posted, calls, behind = [], [], ['response']
+    monkeypatch.setattr(
+        compat, 'sender_is_behind', lambda waitable, data: data in behind)
+    pool = SimpleNamespace(post=posted.extend, call_at=lambda at, call: calls.append(call))
+    source = WaitableSource.__new__(WaitableSource)
+    source._pool = pool
+    entity = SimpleNamespace(rclpy_object=None, depth=0)
+    response, other = (Work(entity, print, (data,)) for data in ('response', 'other'))
+    source._post_noted([response, other])
+    assert posted == [other]
+    calls.pop()()
+    assert posted == [other]
+    behind.clear()
+    calls.pop()()
+    assert posted == [other, response] and not calls
