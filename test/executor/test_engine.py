@@ -15,9 +15,10 @@ from mddag_executor.core.state import N_HOLDING, N_IDLE, WAITING
 from mddag_executor.core.tally import counts
 from mddag_executor.errors import UsageError
 from mddag_executor.executor import due as due_module
+from mddag_executor.executor import workers
 from mddag_executor.executor.agenda import Agenda
 from mddag_executor.executor.attribution import Origin
-from mddag_executor.executor.bounds import NET_NS, PATIENCE_NS, REPORT_NS
+from mddag_executor.executor.bounds import NET_NS, PATIENCE_NS, REPORT_NS, SOON_NS
 from mddag_executor.executor.debugging import engine_lock, InvariantError
 from mddag_executor.executor.engine import Engine
 from mddag_executor.executor.entity import Entity
@@ -963,8 +964,11 @@ def test_a_parked_thread_looks_soon_for_what_comes_during_a_short_callback(
         pool.running = False
 
 
-def test_what_becomes_due_while_no_thread_waits_wakes_one_in_the_next_spin(make_executor):
+@pytest.mark.parametrize('leaving', [0, 1])
+def test_what_becomes_due_while_nothing_spins_wakes_a_thread_in_the_next_spin(
+        make_executor, monkeypatch, leaving):
     """One that is just leaving may have been woken for it in vain."""
+    monkeypatch.setattr(workers, 'END_S', 0.0)
     pool = pool_of(make_executor())
     with pool.lock:
         pool.running, pool.polling = True, 1
@@ -972,7 +976,7 @@ def test_what_becomes_due_while_no_thread_waits_wakes_one_in_the_next_spin(make_
         pool.agenda.set(Appointment(), now, now)
         pool.due.arm(now)
         assert pool.loop.wait(10.0)
-        pool.polling = 0
+        pool.polling = leaving
     pool.pause()
     assert not pool.loop.wait(0)
     with pool.lock:
@@ -1112,6 +1116,39 @@ def test_a_callback_that_is_just_reported_is_asked_again_soon_whether_it_is_over
         assert sink['overdue'] == 1
         pool.running = False
         pool._visitors.remove(me)
+
+
+def test_a_parked_thread_looks_when_something_is_due_but_not_all_the_time(make_executor):
+    """Though a callback that may get messages is known to wait."""
+    pool = pool_of(make_executor(num_workers=2))
+    due, watch = pool.due, pool.parking.watch
+    with pool.lock:
+        pool.running = True
+        now = pool.tick() - pool.offset
+        due.arm_late_look(now, NET_NS)
+        assert watch.at == now + NET_NS
+        pool.agenda.set(Appointment(), now + MS, now + 2 * MS)
+        due.arm_late_look(now, NET_NS)
+        assert watch.at == now + 2 * MS
+        due.expect(new_entity(kind=Eager))
+        due.arm_look(now)
+        assert watch.at == now + SOON_NS
+        pool.running = False
+
+
+def test_a_job_that_has_waited_in_vain_until_the_end_has_expired():
+    """It is not only overdue, though no other job was released after it."""
+    task_set = loads(graph(
+        n='name: tick, timer: 10ms, publishes: [/a], dag: a',
+        m='name: use, subscription: /a, deadline: 1s'))
+    engine = Engine(task_set, 1, 'rad', max_active_jobs=NEVER, expire_after=5 * MS,
+                    default_deadline=10 ** 9)
+    engine.timer_due(Work(entity_of(engine, task_set, 0, 0), print), 0, 0)
+    work = engine.step(0, 0).work
+    engine.finished(work, 0, 0, 0, 0, 0)
+    engine.finish(1200 * MS)
+    sink = engine.verdicts.tally.result()['dags']['a']['sinks']['/m:use']
+    assert (sink['expired'], sink['overdue']) == (1, 0)
 
 
 def test_what_runs_at_once_counts_as_undeclared():

@@ -121,6 +121,9 @@ def test_a_publisher_that_is_noticed_too_late_is_recorded(make_executor, make_no
     assert live['completed'] >= 10
     assert [found.get(key) for key in ('completed', 'not_due')] == [
         live.get(key) for key in ('completed', 'not_due')]
+    recorded = Counter(event['publisher_handle'] for event in read_events(path)
+                       if event['_name'] == 'ros2:rcl_publisher_init')
+    assert {*recorded.values()} == {1}
 
 
 @pytest.mark.parametrize('given', ['rolling', ''])
