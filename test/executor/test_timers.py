@@ -89,6 +89,66 @@ def test_what_is_set_while_appointments_come_due_is_not_due_yet():
     assert come == [first, second] and agenda.next == NEVER
 
 
+def test_an_appointment_that_was_cancelled_does_not_put_off_the_next_one():
+    agenda, come = Agenda(), []
+    several = [Appointed(come) for _ in range(3)]
+    for at, each in enumerate(several):
+        agenda.set(each, at, at)
+    agenda.cancel(several[1])
+    agenda.handle(lambda: 10)
+    assert come == [several[0], several[2]] and agenda.next == agenda.latest == NEVER
+
+
+class FakeTimer:
+    """A timer of which rcl says what it is told to."""
+
+    simulated, waiting, entry, period_of_allowance = False, (), None, -1
+
+    def __init__(self, due, period):
+        self.due, self._period, self.last_period = due, period, period
+        self.next, self.asked = due, 0
+
+    def is_eager(self):
+        return False
+
+    def period(self):
+        return self._period
+
+    def until(self):
+        return self.next - time.monotonic_ns()
+
+    def next_due(self):
+        self.asked += 1
+        return self.next
+
+    def call(self):
+        self.next += self._period
+        return 'work'
+
+
+def test_a_timer_that_was_set_to_an_earlier_time_is_released_then():
+    """It is due already when this is found, for instance after a step of its clock."""
+    queue = TimerQueue(Agenda(), print, print, print)
+    timer = FakeTimer(time.monotonic_ns() - 5 * MS, 1000 * MS)
+    timer.next -= 50 * MS
+    due = timer.next
+    assert queue._fire(timer) == ('work', due, 0, 1000 * MS)
+
+
+def test_the_period_of_a_timer_may_change():
+    """Rcl is asked once when it is due next, and it may stay unnoticed for as long as before."""
+    agenda = Agenda()
+    queue = TimerQueue(agenda, print, print, print)
+    queue.allowance = lambda timer, period: period // 4
+    begin = time.monotonic_ns()
+    timer = FakeTimer(begin + 1000 * MS, 1000 * MS)
+    for period, asked in ((1000, 0), (8000, 1), (8000, 1), (8000, 1)):
+        timer._period = period * MS
+        queue._fire(timer)
+        assert timer.asked == asked
+        assert agenda.latest - agenda.next == period * MS // 4
+
+
 def test_an_appointment_that_fails_leaves_the_times_of_the_others():
     agenda, come = Agenda(), []
     failing, other = Appointed(come), Appointed(come)
@@ -327,6 +387,9 @@ def test_a_timer_runs_by_simulated_time_and_by_nothing_else(make_executor, make_
     with Spinning(executor):
         set_clock(100_000)
         node.create_timer(1.0, lambda: ran.append(clock.now().nanoseconds))
+        brief = node.create_timer(1.0, print)
+        is_quiet()
+        node.destroy_timer(brief)   # the other one still runs
         is_quiet()
         for second in range(101, 106):
             set_clock(second * 1000 - 1)
