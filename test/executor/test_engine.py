@@ -1151,6 +1151,23 @@ def test_a_job_that_has_waited_in_vain_until_the_end_has_expired():
     assert (sink['expired'], sink['overdue']) == (1, 0)
 
 
+def test_another_thread_starts_what_has_waited_for_the_interpreter_when_it_is_free():
+    """Next to something that came first, and does not need it."""
+    engine = new_engine(workers=2)
+    group = engine.scheduler.new_group()
+    first, second, third = (Work(new_entity(*each), print) for each in (
+        (group, 0, True), (group, 0, False), (-1, 0, True)))
+    engine.ready(first, 0)
+    assert engine.step(0, 0).work is first
+    engine.ready(second, 1)
+    engine.ready(third, 2)
+    assert engine.step(1, 3).work is None and not engine.may_start_more(3)
+    engine.finished(first, 0, 4, 4, 0, 0)
+    assert engine.step(0, 4).work is second and engine.may_start_more(4)
+    assert engine.step(1, 4).work is third and not engine.may_start_more(4)
+    check(engine)
+
+
 def test_what_runs_at_once_counts_as_undeclared():
     engine, entity = new_engine(), new_entity()
     engine.ran_at_once(entity)
