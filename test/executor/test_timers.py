@@ -100,7 +100,7 @@ def test_an_appointment_that_was_cancelled_does_not_put_off_the_next_one():
 
 
 class FakeTimer:
-    """A timer of which rcl says what it is told to."""
+    """A timer for which this says what rcl would say."""
 
     simulated, waiting, entry, period_of_allowance = False, (), None, -1
 
