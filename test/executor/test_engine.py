@@ -908,6 +908,8 @@ def test_what_a_thread_finds_waiting_when_it_looks_is_checked_for(make_executor)
     """What has the interpreter runs longer than usual: it may wait."""
     pool = pool_of(make_executor(num_workers=3))
     me, entities = WorkerThread(pool, None), [new_entity(holds=True) for _ in range(2)]
+    me.begin()
+    pool._visitors.append(me)
     with pool.lock:
         pool.running = True
         pool.engine.ready(Work(entities[0], print), pool.tick())
@@ -917,6 +919,7 @@ def test_what_a_thread_finds_waiting_when_it_looks_is_checked_for(make_executor)
         pool._look()
         assert pool.agenda.next < NEVER
         pool.running = False
+    pool._visitors.remove(me)
 
 
 def test_the_deadline_of_what_may_hang_is_watched(make_executor):
@@ -1166,6 +1169,24 @@ def test_another_thread_starts_what_has_waited_for_the_interpreter_when_it_is_fr
     assert engine.step(0, 4).work is second and engine.may_start_more(4)
     assert engine.step(1, 4).work is third and not engine.may_start_more(4)
     check(engine)
+
+
+def test_a_thread_is_woken_for_what_is_urgent_though_something_else_waits_longer():
+    """For the interpreter, which it may not have."""
+    task_set = loads(GRAPH)
+    engine = new_engine(task_set, 3)
+    engine.interpreter.pauses = True
+    urgent = entity_of(engine, task_set, 0, 0)
+    urgent.habit = GilHabit(True)
+    for now in range(2):
+        entity = new_entity(holds=True)
+        entity.habit.mean_ns = 10 ** 9
+        engine.ready(Work(entity, print), now)
+        assert (engine.step(now, now).work is None) == bool(now)
+    assert not engine.may_start_more(MS)
+    engine.timer_due(Work(urgent, print), MS, MS)
+    assert engine.may_start_more(MS)
+    assert engine.step(1, MS).work.entity is urgent
 
 
 def test_what_runs_at_once_counts_as_undeclared():

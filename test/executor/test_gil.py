@@ -16,7 +16,7 @@ from mddag_executor.executor import pausing, publishing
 from mddag_executor.executor.compat import function_of_task
 from mddag_executor.executor.gil import GilHabit
 from mddag_executor.executor.pausing import can_pause
-from mddag_executor.executor.work import current
+from mddag_executor.executor.work import current, Work
 from msg_graph import loads
 import pytest
 from rclpy.action import ActionServer
@@ -472,7 +472,7 @@ def test_equal_code_is_told_apart():
     monitor.end(pauses[0], several[:1])
     assert events() == [False, True]
     monitor.end(pauses[1], several[1:])
-    assert events() == [False, False]
+    assert events() == [False, False] and not monitor._users
 
 
 @pytest.mark.parametrize('suffix, may_pause', [('', False), ('_message_converter', True)])
@@ -500,8 +500,10 @@ class PausedHere:
 @pytest.mark.skipif(not can_pause(), reason='this Python has no sys.monitoring')
 def test_an_interrupted_pause_ends():
     thread = PausedHere(is_inside=False)
-    with pytest.raises(KeyboardInterrupt):
-        pausing.Pause(thread).pause_here()
+    kept = []
+    with pytest.raises(KeyboardInterrupt):  # in one line: else it would pause at the next one
+        (kept.append(pausing.Pause(thread)), kept[0].pause_here())
+    kept[0].pause_here()    # in a handler of a signal, for instance
     assert thread.calls == ['pause', 'resume'] and thread.paused_ns > 0
 
 
@@ -513,6 +515,41 @@ def test_a_thread_that_owns_the_lock_of_the_engine_does_not_pause():
     pause.pause_here()
     pause.end()
     assert thread.calls == []
+
+
+class Overtaken:
+    """A pool with executions that were overtaken; ``calls`` has what is done to them."""
+
+    def __init__(self, overtaken):
+        self.calls, self.lock, self.offset, self.now = [], threading.Lock(), 0, 7
+        self.thread_of = lambda work: SimpleNamespace(ident=0, vtid=0)
+        self.tick = lambda: self.now
+        self.engine = SimpleNamespace(
+            interpreter=SimpleNamespace(holder='urgent', overtaken=overtaken),
+            stop_holding=lambda work: self.calls.append(f'{work} gives way'))
+        self.pauses = pausing.Pauses(self)
+        for name in ('first', 'second'):
+            self.pauses.paused[Work(None, print)] = SimpleNamespace(
+                since=3, end=partial(self.calls.append, f'{name} goes on'))
+
+    def wake_for_more(self):
+        self.calls.append('another thread is woken')
+
+
+def test_those_that_are_still_overtaken_stay_paused():
+    pool = Overtaken([])
+    first, second = pool.pauses.paused
+    pool.engine.interpreter.overtaken.append(first)
+    pool.pauses.end()
+    assert pool.calls == ['second goes on'] and [*pool.pauses.paused] == [first]
+    assert (first.paused_ns, second.paused_ns) == (0, 4)
+
+
+def test_others_may_start_as_well_when_the_urgent_one_waits_for_a_paused_one():
+    pool = Overtaken([])
+    pool.pauses.check(SimpleNamespace(subject='urgent', waits=lambda *_: True))
+    assert pool.calls == [
+        'urgent gives way', 'first goes on', 'second goes on', 'another thread is woken']
 
 
 # --- callbacks that lend their workers, and go on ------------------------------------------------
