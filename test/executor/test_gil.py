@@ -552,6 +552,15 @@ def test_others_may_start_as_well_when_the_urgent_one_waits_for_a_paused_one():
         'urgent gives way', 'first goes on', 'second goes on', 'another thread is woken']
 
 
+def test_a_paused_callback_checks_the_one_that_is_the_most_urgent_now():
+    """Not that of before, whose times are others."""
+    pool = Overtaken([])
+    pool.pauses.check(SimpleNamespace(
+        subject='earlier', begin=lambda *args: pool.calls.append(args[:2]),
+        waits=lambda *_: False))
+    assert pool.calls == [('urgent', 7)]
+
+
 # --- callbacks that lend their workers, and go on ------------------------------------------------
 
 class Lending:

@@ -605,6 +605,17 @@ def test_the_spinning_thread_changes_its_agenda_under_the_lock_only(make_executo
     assert is_inside == [True] and not at_once.pool.is_inside()
 
 
+def test_the_spinning_thread_knows_whether_it_has_handled_anything(make_executor):
+    """Else a ``spin_once`` that has handled a response once would return at once ever after."""
+    at_once, ended = at_once_of(make_executor()), []
+    at_once.pool.callback_ended = lambda *args: ended.append(args)
+    entity = SimpleNamespace(rclpy_object='client', ready=0, ran=0)
+    assert not at_once.handle([])
+    at_once.count(entity)
+    assert ended == [('client', None, -1)]  # who hosts the program knows it as well
+    assert at_once.has_run and not at_once.handle([])
+
+
 def test_a_step_of_the_system_clock_is_noticed(make_executor, make_node, tmp_path, monkeypatch):
     """It is one line in the log, below the table of a run, and of a replay; slewing is none."""
     path = tmp_path / 'run.mcap'
