@@ -8,10 +8,12 @@ import resource
 import signal
 import sys
 import threading
+from types import SimpleNamespace
 import weakref
 
 from mddag_executor import MultiDeadlineExecutor
-from mddag_executor.executor import settings
+from mddag_executor.executor import forks, settings
+from mddag_executor.executor.at_once import SignalPipe
 from mddag_executor.executor.compat import RCLError
 from mddag_executor.executor.ending import Ending
 from mddag_executor.executor.session import Session
@@ -330,3 +332,44 @@ def test_a_context_that_ends_meanwhile_leaves_nothing_behind(monkeypatch, tmp_pa
         gc.collect()
         before.append(used())
     assert wait_for(lambda: used()[0] <= before[0][0] and used()[1] <= before[0][1])
+
+
+# --- copies of the process, and signals ----------------------------------------------------------
+
+@pytest.mark.parametrize(('outcome', 'expected', 'text'), [
+    (SystemExit(), 0, ''), (SystemExit(3), 3, ''), (SystemExit('why'), 1, 'why'),
+    (KeyError('raised'), 1, 'raised'), (None, 1, 'os._exit')])
+def test_the_status_of_a_copy_is_that_of_its_callback(monkeypatch, outcome, expected, text):
+    """What it has printed is not lost."""
+    written, flushed, ended = [], [], []
+
+    def stream(name):
+        return SimpleNamespace(write=written.append, flush=lambda: flushed.append(name))
+
+    monkeypatch.setattr(forks, 'os', SimpleNamespace(_exit=ended.append))
+    monkeypatch.setattr(forks, 'sys', SimpleNamespace(
+        stdout=stream('stdout'), stderr=stream('stderr')))
+    monkeypatch.setattr(forks.traceback, 'print_exception', lambda error: written.append(
+        str(error)))
+    forks.end_copy(SimpleNamespace(entity=SimpleNamespace(label='/a')), outcome)
+    assert ended == [expected] and flushed == ['stdout', 'stderr']
+    assert text in ''.join(written) and bool(text) == bool(written)
+
+
+def test_the_signals_of_another_loop_stay_its_own():
+    """That of asyncio, for instance, which waits for them in the main thread."""
+    pipe, (reads, writes) = SignalPipe(), os.pipe2(os.O_NONBLOCK)
+    before = signal.set_wakeup_fd(writes)
+    try:
+        with pipe.watch():
+            assert signal.set_wakeup_fd(writes) == writes
+        assert signal.set_wakeup_fd(-1) == writes
+        with pipe.watch():
+            found = signal.set_wakeup_fd(-1)
+            assert found >= 0 and signal.set_wakeup_fd(found) == -1
+        assert signal.set_wakeup_fd(-1) == -1
+    finally:
+        signal.set_wakeup_fd(before)
+        pipe.close()
+        os.close(reads)
+        os.close(writes)
