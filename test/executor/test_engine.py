@@ -875,6 +875,58 @@ def test_what_nothing_waits_for_any_more_is_not_checked_and_not_kept():
     assert kept() is None
 
 
+class Holding:
+    """A pool with an execution that holds the interpreter, and one that waits for it."""
+
+    def __init__(self):
+        self.engine, self.agenda, self.now, self.calls = new_engine(workers=2), Agenda(), 0, []
+        self.pauses = SimpleNamespace(is_watched=False, end=lambda: self.calls.append('goes on'))
+        thread = SimpleNamespace(ident=threading.get_ident(), vtid=threading.get_native_id())
+        self.thread_of = lambda work: thread
+        self.check = HolderCheck(self, 0, lambda at: None)
+        self.works = [Work(new_entity(holds=True), print) for _ in range(3)]
+        for number, work in enumerate(self.works):
+            self.engine.ready(work, 0)
+            assert (self.engine.step(number % 2, 0).work is None) == bool(number)
+
+
+def test_what_a_paused_thread_checks_no_other_one_does():
+    pool = Holding()
+    pool.pauses.is_watched = True
+    pool.check.begin_if_wanted(0)
+    overtakes_at = pool.engine.interpreter.overtaking_at()
+    assert pool.agenda.next == overtakes_at
+    pool.pauses.is_watched = False
+    pool.check.begin_if_wanted(0)
+    assert pool.agenda.next < overtakes_at
+
+
+def test_what_runs_longer_than_usual_is_checked_at_once_and_once_more():
+    pool = Holding()
+    pool.check.begin_late(MS)
+    assert pool.check._check.has_begun(pool.works[0])
+
+
+def test_the_next_one_that_computes_is_checked_from_scratch():
+    pool = Holding()
+    pool.check.begin_if_wanted(0)
+    pool.engine.finished(pool.works[0], 0, 1, 1, 0, 0)
+    assert pool.engine.step(0, 1).work is pool.works[1]
+    pool.now = 100 * MS
+    pool.check.come_due()
+    assert pool.check._check.subject is pool.works[1]
+    assert not pool.check._check.has_begun(pool.works[1])
+
+
+def test_the_one_that_was_overtaken_goes_on_when_the_urgent_one_waits():
+    pool = Holding()
+    pool.check._check = SimpleNamespace(
+        subject=pool.works[0], at=0, waits=lambda *_: True, end=lambda: None)
+    pool.check.come_due()
+    assert pool.calls == ['goes on'] and not pool.engine.interpreter.holders
+    assert pool.engine.step(1, 1).work is pool.works[1]
+
+
 @pytest.mark.parametrize('wall_ms', [0, 100])
 def test_what_takes_the_interpreter_is_checked_if_something_waits_for_it(make_executor, wall_ms):
     """Though another thread waits for events already: it may sleep for long."""
