@@ -180,6 +180,10 @@ def test_a_callback_that_has_ended_is_no_miss_before_its_thread_could_say_so(
         assert wait_for(nodes.connected)
         start.publish(Header())
         assert began.wait(60.0)
+        # the end of the source, which is of the same job, has been reported
+        assert wait_for(lambda: not any(
+            each.work is not None and each.work.entity.name == '/source:begin'
+            for each in pool.threads()))
         try:
             with pool.lock:
                 # others may run undeclared callbacks
