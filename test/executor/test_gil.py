@@ -24,7 +24,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from .conftest import is_idle, matched, Spinning, wait_for
+from .conftest import is_idle, matched, shown, Spinning, wait_for
 from .declared import Declared, graph
 from .inside import engine_of, functions_of_tasks, pool_of, registry_of
 
@@ -209,6 +209,7 @@ def test_no_thread_waits_for_events_while_a_callback_computes(computing):
     assert not any(waiting)
 
 
+@shown
 def test_no_thread_looks_all_the_time_because_something_less_urgent_waits(computing, monkeypatch):
     """Nothing may overtake then, though the callback takes longer than usual."""
     pool, looks, steps = pool_of(computing.executor), [], [time.monotonic()]

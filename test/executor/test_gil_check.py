@@ -19,10 +19,8 @@ from mddag_executor.executor.gil import GilHabit, Measurement, short_switch_inte
 from mddag_executor.executor.gil_check import CHECK_NS, GilCheck, LAST_CHECK_NS, waits_for_else
 import pytest
 
-from .conftest import wait_for
+from .conftest import shown, wait_for
 
-shown = pytest.mark.skipif(
-    not gil_check._is_shown(), reason='this kernel does not show what threads do')
 MS = 1_000_000
 keeps_gil = ctypes.PyDLL(None)
 
