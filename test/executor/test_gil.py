@@ -43,6 +43,7 @@ def declare(*callbacks):
     return graph(node='\n'.join(f'name: {name}, dag: {name}, {keys}' for name, keys in callbacks))
 
 
+@shown
 @pytest.mark.parametrize('holds, most', [('true', 1), ('false', 4)])
 def test_as_many_run_at_once_as_the_declaration_says(make_executor, make_node, holds, most):
     """And the interpreter switches between them sooner, as long as the executor spins."""
@@ -183,6 +184,7 @@ def computing(request, make_executor, make_node, monkeypatch):
         yield found
 
 
+@shown
 def test_arrivals_with_an_earlier_deadline_overtake_and_others_wait(computing):
     """
     The long one does not wait for an urgent one, however long it usually takes.
@@ -769,6 +771,7 @@ def test_a_callback_waits_for_its_worker_while_others_end(
     assert len(checks) > 20 and lending.ran == ['lends', 'waits', 'goes on', 'ends']
 
 
+@shown
 @pytest.mark.parametrize('is_async', [False, True])
 def test_a_task_holds_the_gil_if_its_function_does(make_executor, make_node, is_async):
     """That is learnt of each function: tasks that wait do not change it."""
