@@ -41,6 +41,7 @@ from mddag_executor.recording.columns import concatenate, Ints, Mask, Table
 from mddag_executor.recording.head import Head, ReplayError
 from mddag_executor.recording.joins import different, RowNumbers, sort_by
 from mddag_executor.recording.losses import Loss, Losses
+from mddag_executor.recording.names import Names
 from mddag_executor.recording.recorded_jobs import Jobs
 from mddag_executor.recording.recording import Recording
 from mddag_executor.recording.run import Run
@@ -138,10 +139,14 @@ class _Part:
         thread[:] = np.array([threads.of(self.place, each) for each in numbers.tolist()],
                              dtype=np.int64)[of]
 
-    def move(self) -> None:
-        """Convert its times to the joined clock (rule 1)."""
+    def move(self, names: Names) -> None:
+        """Convert its times, and those of its callbacks, to the joined clock (rule 1)."""
         tables = self.found.tables
         if self.shift:
+            for callback in names.callbacks:
+                place = callback.address[1] >> _BITS if callback.address is not None else -1
+                if place == self.place and callback.gone is not None:
+                    callback.gone += self.shift
             self.seen_at = self.seen_at + self.shift
             for name, columns in _TIMES.items():
                 for column in columns:
@@ -298,7 +303,7 @@ class Joined:
             count += part.reader.message_count or 0
         self._set_clocks()
         for part in self._parts:
-            part.move()
+            part.move(who.names)
         hosted = self._number_jobs()
         rows = [part.renumber(self._legs, self._dag_of) for part in self._parts]
         self._check_run()

@@ -311,6 +311,11 @@ def reschedule(
         warnings.append(
             f'{run.name}: the time in which coroutines waited is left out: '
             + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
+    stepping = _stepping(run)
+    if stepping:
+        warnings.append(
+            f'{run.name}: the time in which programs did not spin is left out, as if they ran '
+            f'callbacks all the time: {listed(stepping)}')
     settings = Settings(
         policy, pools, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
         judge_from=max(begin, judge_from), judge_until=judge_until,
@@ -318,6 +323,19 @@ def reschedule(
     with gc_paused():
         return Reschedule(
             run, work, tables, settings, warnings, skip, overheads, placed, recorded)
+
+
+def _stepping(run: Recording) -> list[str]:
+    """Return the declared callbacks that could not run for 1 % of the time: nothing spun."""
+    found: set[str] = set()
+    least = (run.end - (run.start or run.end)) / 100
+    for program, mine, _, _ in run.closed_times():
+        gaps = run.spin_gaps[run.spin_gaps['program'] == program]
+        vertices = distinct(run.executions['vertex'][mine])
+        if (gaps['end'] - gaps['start']).sum() > least:
+            found.update(run.task_set.vertices[vertex].callback.key
+                         for vertex in vertices[vertices >= 0].tolist())
+    return sorted(found)
 
 
 def _processes(run: Recording, placed: Sequence[Process]) -> list[int]:

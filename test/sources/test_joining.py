@@ -5,7 +5,7 @@
 import json
 from pathlib import Path
 
-from mddag_executor import replay, ReplayError, reschedule, Traces
+from mddag_executor import open_recording, replay, ReplayError, reschedule, Traces
 from mddag_executor.core import NEVER
 from mddag_executor.core.state import SINK_ABORTED, SINK_DROPPED
 from mddag_executor.core.tally import counts
@@ -144,6 +144,11 @@ def two_machines(folder, late, back=True):
         up.sends(down, 1, release + 2 * MS, (i + 4) * MS // 10)
         if back:
             down.sends(up, 2, release + 4 * MS, (i + 2) * MS // 10)
+    down.add('rcl_subscription_init', 0, 3, 1, 3, '/other', 10)
+    down.add('rclcpp_subscription_init', 0, 3, 30)
+    down.add('rclcpp_subscription_callback_added', 0, 30, ADDRESS + 5)
+    down.add('gone', 90 * MS, ADDRESS + 5)
+    down.add('spin_gap', 80 * MS, -1, BASE + 70 * MS - late, BASE + 80 * MS - late)
     return [up.end(100 * MS), down.end(100 * MS)]
 
 
@@ -151,6 +156,12 @@ def two_machines(folder, late, back=True):
 def test_messages_both_ways_tell_how_clocks_of_two_machines_differ(tmp_path, late, call):
     paths = two_machines(tmp_path, late)
     result = replay(paths).result()
+    recording = open_recording(paths)   # all times are by one clock
+    gone, = (each.gone for each in recording.names.callbacks if each.gone is not None)
+    gap, = recording.spin_gaps.records().tolist()
+    for time, ms in ((gone, 90), *zip(gap[2:], (70, 80))):
+        assert abs(time - BASE - ms * MS) <= 300_000
+    assert gap[:2] == (1, -1)
     warning, = result['warnings']
     # from up to down 0.4 ms at least, back 0.2 ms
     ahead = f'{abs(100_000 - late) / 1e6:.3f} ms ' + ('ahead' if late < 100_000 else 'behind')

@@ -237,6 +237,30 @@ nodes:
         f'{path}: the time in which coroutines waited is left out: /n:a']
 
 
+@pytest.mark.parametrize(('gap', 'is_long'), [(40, True), (1, False)])
+def test_what_a_program_did_between_its_spins_is_left_out_with_a_warning(tmp_path, gap, is_long):
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+nodes:
+  - node: /n
+    callbacks:
+      - {name: a, timer: 50ms, publishes: [/x]}
+      - {name: b, subscription: /x, deadline: 20ms}
+""", 1)
+    trace.program(3, 1001)
+    for job in range(10):
+        at = 50 * job
+        trace.release(0, job, at)
+        trace.run(0, 0, job, at, at + 1)
+        trace.add('spin_gap', at + 1 + gap * (job == 5), 3, ns(at + 1), ns(
+            at + 1 + gap * (job == 5)))
+        trace.run(0, 1, job, at + 1 + gap * (job == 5), at + 2 + gap * (job == 5), ready=at + 1)
+    found = [each for each in reschedule(trace.end(500)).warnings if 'spin' in each]
+    assert found == [
+        f'{trace.path}: the time in which programs did not spin is left out, as if they ran '
+        'callbacks all the time: /n:b'] * is_long
+
+
 def test_the_messages_of_a_simulated_sync_took_no_time(tmp_path, call):
     """It ran once, when the later message was there: that of its first leg."""
     graph, path = tmp_path / 'g.yaml', tmp_path / 'a.mcap'
