@@ -229,9 +229,10 @@ def _suspects(task_set: TaskSet, observed: Observed) -> dict[str, Drift]:
         if observed.nodes is not None and may_run_elsewhere(
                 callback, of_callback, observed.nodes, task_set):
             continue
-        why = _never_ran(callback, of_callback, observed) if callback.key in certain else None
-        if why is None and callback.key in certain:
-            why = _gone(callback, of_callback, observed)
+        why = None
+        if callback.key in certain:
+            why = _gone(callback, of_callback, observed) or _never_ran(
+                callback, of_callback, observed)
         if why is None:
             if callback.period_ns is not None:
                 why = _source_rate(callback, callback.period_ns, observed)
