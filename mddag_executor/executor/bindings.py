@@ -83,6 +83,7 @@ class Bindings:
         assert self._task_set is not None
         self._found.add(callback.key)
         self._gone.pop((callback.key, entity.topic), None)
+        engine.verdicts.gone = {*self.gone()}
         entity.declare(callback)
         link(entity, self._task_set, engine.tables)
         entity.awaiting = engine.answers.awaiting.get(callback.key)
@@ -97,6 +98,7 @@ class Bindings:
         if self._binder is not None and entity.callback is not None:
             self._binder.release(entity.callback, entity.topic or None)
             self._gone[entity.callback.key, entity.topic] = now
+            self._engine.verdicts.gone = {*self.gone()}
 
     def gone(self) -> dict[str, int]:
         """Return by declared callback when an entity disappeared that it still lacks."""

@@ -166,9 +166,11 @@ class MissLog:
             dag, sink, job, deadline_ns = self._verdicts.last_missed()
             since = f' within {now - self._at:.0f} s' if self._logged else ''
             since += ', the last' if count > 1 else ''
+            is_gone = sink.partition('@')[0] in self._verdicts.gone
             get_logger('mddag_executor').warning(printable(
                 f'{counted(count, "deadline")} missed{since}: {sink}, {deadline_ns / 1e6:g} ms, '
-                f'job {job} of {dag}'))
+                f'job {job} of {dag}' + (
+                    ' (its program destroyed it, or has ended)' if is_gone else '')))
             self._logged += count
             self._at = now
         finally:

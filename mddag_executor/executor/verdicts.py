@@ -81,6 +81,8 @@ class Verdicts:
         #: How many misses were reported, each of them once.
         self.missed = 0
         self._last_missed = -1, -1
+        #: The declared callbacks that lack a timer, a subscription or a service that they had.
+        self.gone: set[str] = set()
         self.record = record
         self._dags = task_set.dags if task_set is not None else ()
         self._tables = tables

@@ -30,6 +30,7 @@ from std_msgs.msg import Empty, String
 from ..json_results import errors_of
 from .conftest import is_idle, Spinning, wait_for
 from .declared import CHAIN, Declared, graph
+from .inside import engine_of
 
 SECOND = 1_000_000_000
 
@@ -296,9 +297,10 @@ def test_a_callback_whose_node_has_ended_is_named(
         eye.destroy_node()
         assert wait_for(found)
         live = found()
+        assert engine_of(executor).verdicts.gone == {'/eye:see'}
         if is_made_again:
             see()
-            assert found() == []
+            assert found() == [] and not engine_of(executor).verdicts.gone
     if is_made_again:
         assert [each.kind for each in drift_of(open_recording(path))] in ([], ['rate'])
         return

@@ -251,12 +251,14 @@ def test_a_callback_that_hangs_is_a_miss_once(make_executor, make_node, tmp_path
 def test_between_two_lines_of_the_log_a_miss_costs_nothing(monkeypatch, capfd):
     now = [100.0]
     monkeypatch.setattr(misses, 'time', SimpleNamespace(monotonic=lambda: now[0]))
-    verdicts = SimpleNamespace(missed=0, last_missed=lambda: ('dag', 'sink', 7, 1_000_000))
+    verdicts = SimpleNamespace(
+        missed=0, gone=set(), last_missed=lambda: ('dag', 'sink', 7, 1_000_000))
     log = misses.MissLog(verdicts)
     assert not log.is_behind()
     for missed, at, is_behind in ((1, 100.0, True), (2, 101.0, False), (3, 109.9, False),
                                   (4, 110.0, True), (5, 119.0, False), (5, 120.0, True)):
         verdicts.missed, now[0] = missed, at
+        verdicts.gone = {'sink'} if missed == 5 else set()
         assert log.is_behind() is is_behind
         if is_behind:
             log.write()
@@ -265,7 +267,8 @@ def test_between_two_lines_of_the_log_a_miss_costs_nothing(monkeypatch, capfd):
     assert [line[line.index(']: ') + 3:] for line in capfd.readouterr().err.splitlines()] == [
         '1 deadline missed: sink, 1 ms, job 7 of dag',
         '3 deadlines missed within 10 s, the last: sink, 1 ms, job 7 of dag',
-        '1 deadline missed within 10 s: sink, 1 ms, job 7 of dag']
+        '1 deadline missed within 10 s: sink, 1 ms, job 7 of dag '
+        '(its program destroyed it, or has ended)']
 
 
 def test_misses_after_a_line_of_the_log_are_in_a_later_one(
