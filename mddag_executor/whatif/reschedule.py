@@ -16,6 +16,7 @@ from functools import cached_property, partial
 from typing import Any, TYPE_CHECKING
 
 from mddag_executor.analysis.as_recorded import recording_result, Replay
+from mddag_executor.analysis.spans import crowded, Spans
 from mddag_executor.analysis.usage import share
 from mddag_executor.core import EXPIRE_AFTER_NS, NEVER, processes_of, Tables, Tally
 from mddag_executor.core.tables import DEMOTE, ON_LATE
@@ -326,15 +327,19 @@ def reschedule(
 
 
 def _stepping(run: Recording) -> list[str]:
-    """Return the declared callbacks that could not run for 1 % of the time: nothing spun."""
+    """Return the declared callbacks that waited until something spun, for 1 % of the time."""
     found: set[str] = set()
+    table, gaps = run.executions, run.spin_gaps
     least = (run.end - (run.start or run.end)) / 100
     for program, mine, _, _ in run.closed_times():
-        gaps = run.spin_gaps[run.spin_gaps['program'] == program]
-        vertices = distinct(run.executions['vertex'][mine])
-        if (gaps['end'] - gaps['start']).sum() > least:
+        of = gaps[gaps['program'] == program]
+        rows = np.flatnonzero(
+            mine & (table['vertex'] >= 0) & (table['piece'] == 0) & (table['start'] >= 0))
+        waited = Spans(*crowded(of['start'], of['end'], 1)).within(
+            table['ready'][rows], table['start'][rows])
+        if waited.sum() > least:
             found.update(run.task_set.vertices[vertex].callback.key
-                         for vertex in vertices[vertices >= 0].tolist())
+                         for vertex in distinct(table['vertex'][rows[waited > 0]]).tolist())
     return sorted(found)
 
 
