@@ -15,6 +15,7 @@ import weakref
 from mddag_executor.core.state import State
 from mddag_executor.executor import publishing, waitables
 from mddag_executor.executor.registry import OTHERS
+from mddag_executor.executor.transfers import Transfer
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -390,6 +391,22 @@ class Moving:
 
 def waiting(executor):
     return sum(each['waiting'] for each in executor.statistics()['callbacks'].values())
+
+
+class Owner:
+    """What listens to an object."""
+
+    def __init__(self, give_up):
+        self.give_up = give_up
+
+
+def test_only_another_executor_requests_what_waits():
+    """One that begins to listen again keeps it."""
+    given_up, transfer = [], Transfer()
+    first, second = (Owner(given_up.append) for _ in range(2))
+    for owner, expected in ((first, []), (first, []), (second, ['timer'])):
+        transfer.claim(owner, 'timer')
+        assert given_up == expected
 
 
 @pytest.mark.parametrize('shuts_down', [False, True])
