@@ -834,14 +834,19 @@ class MultiDeadlineExecutor(BareExecutor):
         self._ending.end_run()
         reported = self._notifier is None or self._notifier.stop(timeout_sec)
         finished: bool = super().shutdown(timeout_sec)
-        if self._spinning.acquire(blocking=False):  # else the spin does that at its end
+        self._close_unless_spinning()
+        return finished and reported and in_time
+
+    def _close_unless_spinning(self) -> None:
+        """Close the descriptors, once the run has ended; a spin does that at its end."""
+        if self._spinning.acquire(blocking=False):
             self._ending.close()
             self._spinning.release()
-        return finished and reported and in_time
 
     def abandon_callbacks(self) -> None:
         """After ``shutdown``, judge open jobs and complete the trace, though callbacks run."""
         self._ending.end_run()
+        self._close_unless_spinning()
 
     def begin_end(self) -> None:
         """Ask the executor to end."""
