@@ -138,7 +138,8 @@ class PublisherNumbers:
     def confirm(self, count: int, sequence: int) -> None:
         """Note that a message is the publication with this count."""
         self.offset = sequence - count
-        self._found = max(count, self._found)
+        if count > self._found:
+            self._found = count
         self._unlike = (0, NO_NUMBER, 0)
 
 

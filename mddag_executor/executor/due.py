@@ -292,7 +292,7 @@ class DueTimes:
         at, cpu = self._timer.at, process_time_ns()
         seen, used = self._seen
         self._seen = now, cpu
-        if now - max(at, seen) >= STOP_NS:
+        if now - at >= STOP_NS and now - seen >= STOP_NS:
             waited = self._pool.waited_since(since) - self._offset
             late = now - max(at, seen, waited) - (cpu - used)
             if late >= STOP_NS:

@@ -132,16 +132,28 @@ class Engine:
     :param process: the declared process that this is.
     """
 
+    # more attributes than CPython reads quickly from a dictionary; the most used are first
+    __slots__ = (
+        '_bypass', '_ready', '_deferred', '_scalars', '_holders', '_state', 'tables', 'scheduler',
+        'no_step', '_step', '_past_core', 'interpreter', 'n_workers', '_take', '_complete',
+        '_make_ready', '_note_time', '_work', '_is_plain', '_is_watched', '_records',
+        '_to_ask_again', '_finished', '_may_bypass', 'outer', 'other_processes', 'deadlines',
+        'verdicts', '_next_job', 'notes_publications', 'attribution', '_undeclared',
+        'sent_requests', 'path_watch', 'optional_topics', 'answers', 'dag_names', 'record',
+        'recorder', 'on_late', 'clock_steps', '_ended', 'spin_gaps', '_keys_are_times',
+        '_default_deadline')
+
     def __init__(
         self, task_set: TaskSet | None, n_workers: int, policy: str, *, default_deadline: int,
         max_active_jobs: int, expire_after: int, on_late: str = 'demote',
         record: Record | None = None, on_miss: Callable[[DeadlineMiss], None] | None = None,
         process: str | None = None,
     ) -> None:
-        self.tables = Tables.build(
+        self.scheduler = Scheduler(Tables.build(
             task_set, legs=True, default_deadline=default_deadline,
-            max_active_jobs=max_active_jobs, expire_after=expire_after, on_late=on_late)
-        self.scheduler = Scheduler(self.tables, n_workers, policy)
+            max_active_jobs=max_active_jobs, expire_after=expire_after, on_late=on_late),
+            n_workers, policy)
+        self.tables = self.scheduler.tables  # attributes: those of a named tuple are slower
         self.deadlines = Deadlines(self.tables, self.scheduler.state)
         self._note_time = Estimates(self.tables, self.scheduler.state).note
         self.verdicts = Verdicts(task_set, self.tables, record, on_miss)
@@ -223,7 +235,7 @@ class Engine:
         if entity.removed or self._finished:
             entity.leave([work])
             return
-        release = max(entity.since, min(due, now))
+        release = self._release_from(entity, due, now)
         if work.was_reset and entity.waiting:
             self._drop_withdrawn(work, now)
         if entity.depth and len(entity.waiting) >= entity.depth:
@@ -242,6 +254,13 @@ class Engine:
         for x in list(newest.entity.waiting):
             if self._work[x].n_resets != newest.n_resets:
                 self._drop(newest.entity, x, 'withdrawn', now)
+
+    @staticmethod
+    def _release_from(entity: Entity, due: int, now: int) -> int:
+        """Return the release of a job: neither to come, nor before the entity was managed."""
+        # CPython calls min() and max() slowly
+        release = due if due < now else now
+        return release if release > entity.since else entity.since
 
     def _is_over(self, dag: int) -> bool:
         """
@@ -284,7 +303,7 @@ class Engine:
             entity.leave([work])
             return
         if entity.source >= 0:
-            self._start_job(work, max(entity.since, min(release, now)), now)
+            self._start_job(work, self._release_from(entity, release, now), now)
             if stamp >= 0 and self.other_processes is not None and work.origin is not None:
                 self.other_processes.note(stamp, work.origin)
             if 0 < entity.depth < len(entity.waiting):

@@ -35,12 +35,11 @@ from mddag_executor.core import NEVER
 from mddag_executor.errors import MddagError
 
 _libc = ctypes.PyDLL(None, use_errno=True)  # no call blocks, so the GIL is kept
-# those of the hot path, without errno; ``os`` and ``select`` would let another thread take the GIL
+# Those of the hot path, without errno, and without ``argtypes``, whose conversions take a third of
+# a call.  ``os`` and ``select`` would let another thread take the GIL.
 _quick = ctypes.PyDLL(None)
 _eventfd_write = _quick.eventfd_write
-_eventfd_write.argtypes = [ctypes.c_int, ctypes.c_uint64]
 _eventfd_read = _quick.eventfd_read
-_eventfd_read.argtypes = [ctypes.c_int, ctypes.c_void_p]
 _rcl = ctypes.CDLL('librcl.so')  # rclpy has loaded it
 _WRITE = ctypes.cast(_libc.eventfd_write, ctypes.c_void_p)
 
@@ -68,15 +67,8 @@ def _setter(name: str) -> Any:
 
 _SET = {kind: _setter(name) for kind, name in _SETTERS.items()}
 
-_next_call_time = _rcl.rcl_timer_get_next_call_time
-_next_call_time.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
-_next_call_time.restype = ctypes.c_int
-
+_next_call_time = ctypes.PyDLL('librcl.so').rcl_timer_get_next_call_time  # it reads one number
 _until_next_call = _rcl.rcl_timer_get_time_until_next_call
-_until_next_call.argtypes = [ctypes.c_void_p, ctypes.c_void_p]
-_until_next_call.restype = ctypes.c_int
-
-# without errno and conversions of arguments: half the time, for each timer that is due
 _timer_settime = _quick.timerfd_settime
 
 
@@ -130,7 +122,7 @@ def new_eventfd() -> int:
 
 def announce(fd: int, count: int = 1) -> None:
     """Add to the count of an eventfd; a closed one is ignored."""
-    _eventfd_write(fd, count)
+    _eventfd_write(fd, ctypes.c_uint64(count))
 
 
 def read_count(fd: int) -> int:
@@ -190,24 +182,21 @@ class Poll:
 class NextCall:
     """The time of the next call of the rcl timer at an address, on the timer's clock."""
 
-    __slots__ = ('_address', '_value', '_reference')
+    __slots__ = ('_value', '_read', '_until')
 
     def __init__(self, address: int) -> None:
-        self._address = address
         self._value = ctypes.c_int64()
-        self._reference = ctypes.byref(self._value)
+        arguments = ctypes.c_void_p(address), ctypes.byref(self._value)
+        self._read: Callable[[], int] = partial(_next_call_time, *arguments)
+        self._until: Callable[[], int] = partial(_until_next_call, *arguments)
 
     def read(self) -> int | None:
         """Return the time in ns; None when the timer is cancelled."""
-        if _next_call_time(self._address, self._reference) != 0:
-            return None
-        return self._value.value
+        return self._value.value if self._read() == 0 else None
 
     def until(self) -> int | None:
         """Return the time until then in ns, negative if it is due; None when it is cancelled."""
-        if _until_next_call(self._address, self._reference) != 0:
-            return None
-        return self._value.value
+        return self._value.value if self._until() == 0 else None
 
 
 def _nothing() -> int:

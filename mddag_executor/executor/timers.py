@@ -358,8 +358,8 @@ class TimerQueue:
             self._push(source, now + ZERO_PERIOD_NS)
             return None if work is None else (work, now, 0, 0)
         self._push(source, after)
-        missed = max(0, (after - due + period // 2) // period - 1)
-        return None if work is None else (work, due, missed, period)
+        missed = (after - due + period // 2) // period - 1
+        return None if work is None else (work, due, missed if missed > 0 else 0, period)
 
     def _fire_simulated(self, source: TimerEntity) -> Fired | None:
         if not source.is_due():

@@ -99,6 +99,19 @@ class WorkerPool:
     :ivar announcements: of other processes; None: there are none.
     """
 
+    # more attributes than CPython reads quickly from a dictionary; the most used are first
+    __slots__ = (
+        'lock', 'now', 'offset', 'running', 'is_spin_once', 'polling', 'engine', '_next_step',
+        '_rejoining', '_interpreter', '_holders', 'unlocked_calls', '_polled_at', 'last_end',
+        '_paused', '_verdicts', '_misses', '_judges', 'due', '_history', '_leaving', '_n_parked',
+        '_eager', '_bell_rings', '_channels', '_timer', 'agenda', 'timers', 'is_current',
+        'is_recorded', 'callback_ended', 'loop', '_has_called', 'clock', 'stamped_releases',
+        'parking', 'announcements', 'stopped_at', 'pauses', 'lending', 'outer_groups',
+        'freed_outer_groups', 'context', 'wake_executor', '_executor', 'fail', '_miss_log',
+        '_logs_later', '_prepare_thread', '_threads', '_visitors', '_lacks_threads', '_closed',
+        '_at_end', '_close', '_all_left', '_asks_later', '_of_next_turn', '_loops', 'outside',
+        '__weakref__')
+
     def __init__(
         self, engine: Engine, clock: TraceClock, fail: Callable[[BaseException], None],
         prepare_thread: Callable[[], None] | None = None,

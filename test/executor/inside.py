@@ -13,6 +13,14 @@ def engine_of(executor):
     return executor._engine
 
 
+def replace_method(patch, owner, name, function):
+    """Replace a method of one object, whose class has slots; ``patch``: pytest's monkeypatch."""
+    kind = type(owner)
+    method = getattr(kind, name)
+    patch.setattr(kind, name, lambda self, *args, **more: (
+        function(*args, **more) if self is owner else method(self, *args, **more)))
+
+
 def at_once_of(executor):
     """Return what its spinning thread handles itself: see ``at_once.AtOnce``."""
     return executor._at_once

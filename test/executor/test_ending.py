@@ -26,7 +26,7 @@ from rclpy.task import Future
 from std_msgs.msg import Header
 
 from .conftest import patience, Spinning, wait_for
-from .inside import pool_of
+from .inside import pool_of, replace_method
 
 LIMIT = resource.RLIMIT_NOFILE
 
@@ -210,13 +210,12 @@ def test_an_interrupt_at_the_end_of_a_spin_leaves_an_executor_that_can_be_shut_d
     context = Context()
     rclpy.init(context=context)
     executor = MultiDeadlineExecutor(context=context)
-    close = pool_of(executor).close
 
     def interrupted(timeout):
-        monkeypatch.setattr(pool_of(executor), 'close', close)
+        monkeypatch.undo()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pool_of(executor), 'close', interrupted)
+    replace_method(monkeypatch, pool_of(executor), 'close', interrupted)
     executor.create_task(rclpy.shutdown, context=context)
     with pytest.raises(KeyboardInterrupt):
         executor.spin()

@@ -35,7 +35,7 @@ from ..core.task_sets import Case, cases, TICK
 from ..invariants import broken_invariants
 from .conftest import Spinning, wait_for
 from .declared import graph
-from .inside import engine_of, pool_of
+from .inside import engine_of, pool_of, replace_method
 
 HORIZON = 60
 MS = 1_000_000
@@ -1298,7 +1298,8 @@ def test_a_late_wake_up_is_no_stop_if_all_threads_ran_callbacks(
     """No thread waited for the timer then; nor if the process computed meanwhile."""
     pool, used, found = pool_of(make_executor()), [0], []
     monkeypatch.setattr(due_module, 'process_time_ns', lambda: used[0])
-    monkeypatch.setattr(pool.engine, 'machine_stopped', lambda *times: found.append(times))
+    replace_method(
+        monkeypatch, pool.engine, 'machine_stopped', lambda *times: found.append(times))
     now = pool.clock.now()
     begin = now - 100 * MS - pool.offset
     with pool.lock:

@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import is_idle, matched, shown, Spinning, wait_for
 from .declared import Declared, graph
-from .inside import engine_of, functions_of_tasks, pool_of, registry_of
+from .inside import engine_of, functions_of_tasks, pool_of, registry_of, replace_method
 
 MS = 1_000_000
 
@@ -216,7 +216,7 @@ def test_no_thread_looks_all_the_time_because_something_less_urgent_waits(comput
     """Nothing may overtake then, though the callback takes longer than usual."""
     pool, looks, steps = pool_of(computing.executor), [], [time.monotonic()]
     look = pool._look
-    monkeypatch.setattr(pool, '_look', lambda: (looks.append(1), look()))
+    replace_method(monkeypatch, pool, '_look', lambda: (looks.append(1), look()))
 
     def meanwhile():
         steps.append(time.monotonic())

@@ -30,7 +30,7 @@ from std_srvs.srv import Trigger
 from ..conftest import run_program
 from .conftest import patience, Pulse, Spinning, wait_for
 from .declared import graph
-from .inside import pool_of
+from .inside import pool_of, replace_method
 
 # --- what comes out ------------------------------------------------------------------------------
 
@@ -880,7 +880,8 @@ def test_a_signal_s_handler_may_publish(where):
     assert run_program(PUBLISHES, where, text)[0] == '200 200\n'
 
 
-def test_what_arrives_while_a_spin_ends_is_for_the_next_one(make_executor, make_node):
+def test_what_arrives_while_a_spin_ends_is_for_the_next_one(
+        make_executor, make_node, monkeypatch):
     """The thread that waits for events may get the last one after the end has begun."""
     node, ran, handled = make_node(), [], threading.Event()
     guard = node.create_guard_condition(lambda: ran.append(1))
@@ -899,7 +900,7 @@ def test_what_arrives_while_a_spin_ends_is_for_the_next_one(make_executor, make_
                 handled.set()
 
     is_to_end = []
-    pool._receive = end_before
+    replace_method(monkeypatch, pool, '_receive', end_before)
     thread = threading.Thread(target=executor.spin_until_future_complete, args=(future,))
     thread.start()
     assert wait_for(lambda: pool.is_current and pool.polling)

@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 
 from .conftest import Spinning, wait_for
 from .declared import graph
-from .inside import engine_of
+from .inside import engine_of, replace_method
 
 GRAPH = graph(
     robot="""
@@ -96,12 +96,12 @@ def is_noted(path, killed, waits_for):
         return False
 
 
-def count_notes(executor):
+def count_notes(patch, executor):
     """Return a list that gets the number of unfinished executions each time they are noted."""
     engine, notes = engine_of(executor), []
     note = engine.note_unfinished
-    engine.note_unfinished = lambda several, now: (
-        notes.append(len(several)), note(several, now))
+    replace_method(patch, engine, 'note_unfinished', lambda several, now: (
+        notes.append(len(several)), note(several, now)))
     return notes
 
 
@@ -180,7 +180,7 @@ def test_what_runs_long_and_ends_is_recorded_once(
 
     slow.create_timer(0.01, work)
     executor = make_executor(loads(GRAPH), trace=str(path), nodes=[robot.node, slow])
-    notes = count_notes(executor)
+    notes = count_notes(monkeypatch, executor)
     with Session(executor):
         assert wait_for(lambda: notes.count(2) > 1)
         robot.release()
@@ -207,7 +207,7 @@ def test_a_coroutine_outlives_the_client_that_it_waits_for(
 
     timer = node.create_timer(0.01, ask)
     executor = make_executor(trace=str(tmp_path / 'run.mcap'), nodes=[node])
-    notes = count_notes(executor)
+    notes = count_notes(monkeypatch, executor)
     with Spinning(executor):
         assert wait_for(engine_of(executor).begun)
         node.destroy_client(client)
@@ -241,7 +241,7 @@ def test_a_coroutine_that_has_slept_waits_for_a_worker(
     sleeper = node.create_timer(0.01, sleep, callback_group=reentrant)
     executor = make_executor(num_workers=1, trace=str(tmp_path / 'run.mcap'), nodes=[node],
                              diagnostics_period='10s')
-    engine, notes = engine_of(executor), count_notes(executor)
+    engine, notes = engine_of(executor), count_notes(monkeypatch, executor)
     with Spinning(executor):
         assert wait_for(engine.begun)
         blocker = node.create_timer(0.01, block, callback_group=reentrant)
