@@ -46,9 +46,17 @@ QUIET_NS = 5_000_000
 If the last rest of a thread was longer ago, the next look is set by the next timer.
 
 The look comes ``NET_NS`` after the next timer or other appointment, for which a thread wakes up
-anyway.  So the callback of the timer need not set the look.  In a process with many callbacks,
-the look is put off by up to ``NET_NS`` instead, for the same reason, unless it would not come
-within ``NET_NS`` less this.
+anyway, or at the latest time at which the one after that must be noticed.  So the callback of the
+timer need not set the look.  In a process with many callbacks, of which no timer is due soon, the
+look is put off by up to ``NET_NS`` instead, for the same reason, unless it would not come within
+``NET_NS`` less this.
+"""
+
+AFTER_NS = 2_000_000
+"""
+A look that was set for this time after the next timer, or for later, is not put off.
+
+The callbacks that begin with the timer have usually ended by then.
 """
 
 LOOK_PART = 4

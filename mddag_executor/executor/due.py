@@ -14,7 +14,8 @@ Theory of operation
     wait has to start at once.  One that computes may wait for a part of its relative deadline
     (``LOOK_PART``).  The times at which timers are due are known, but messages of other processes
     may come at any time.  If a callback ends before the look, no thread is woken: the next
-    callback puts the look off, unless its time is good enough.
+    callback puts the look off, unless its time is good enough.  What would have to be done within
+    ``SHORT_CALLBACK_NS`` then, the thread of the callback that has ended does itself.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from typing import Any, Protocol
 from mddag_executor.clocks import SystemClock, TraceClock
 from mddag_executor.core import NEVER
 from mddag_executor.executor.bounds import (
+    AFTER_NS,
     AGAIN_NS,
     LOOK_PART,
     NET_NS,
@@ -222,12 +224,13 @@ class DueTimes:
             self._timer.arm(first)
         # A parked thread would look in vain, as this one waits.  The look is not cancelled but
         # put off, so that the next callback need not set it.
-        watch = self._watch
-        if now - self._rested_at > QUIET_NS:
-            if watch.at < first + QUIET_NS and watch.at < NEVER:
-                watch.arm(first + NET_NS if first < NEVER else NEVER)
-        elif watch.at < now + NET_NS - QUIET_NS:
-            watch.arm(now + NET_NS)
+        watch, latest = self._watch, now + NET_NS
+        soon = latest - QUIET_NS
+        if first < soon or now - self._rested_at > QUIET_NS:
+            soon, latest = first + AFTER_NS, first + NET_NS
+        if watch.at < soon and watch.at < NEVER:
+            at = self._agenda.latest  # the next callback would set it to this, or later
+            watch.arm(at if soon <= at < latest else min(latest, NEVER))
         self._rested_at = now
 
     def arm_by(self, at: int) -> None:
@@ -269,6 +272,8 @@ class DueTimes:
 
         :param patience: how long what waits, or may come, may wait for it.
         """
+        if self.check.entry:
+            self.check.note(now)  # what was to be checked may have ended
         at = now + patience
         if self._agenda.latest < at:
             at = self._agenda.latest

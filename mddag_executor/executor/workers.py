@@ -625,8 +625,10 @@ class WorkerPool:
                     self.lending.let_go_on()
                 if work.entity.removed:
                     self.wake_executor()  # the registry can forget it now
-                if now - self._polled_at > SHORT_CALLBACK_NS and me.thread is not None:
-                    self._look()
+                if me.thread is not None and (
+                        now - self._polled_at > SHORT_CALLBACK_NS
+                        or self.agenda.latest < now - self.offset + SHORT_CALLBACK_NS):
+                    self._look()  # else another thread may have to, in a moment
             if is_last:
                 found = False
                 self.due.arm(now - self.offset)

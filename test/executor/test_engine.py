@@ -831,6 +831,10 @@ class Appointment:
     """Something that is done at a time."""
 
     entry = None
+    is_done = False
+
+    def come_due(self):
+        self.is_done = True
 
 
 def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
@@ -851,6 +855,67 @@ def test_a_thread_that_rests_puts_off_the_next_look(make_executor):
             found.append((watch.at - begin) // MS)
         pool.running, pool.polling = False, 0
     assert found == [NEVER, 121, 120, NEVER, 170, 170, 150]
+
+
+def test_a_look_is_put_off_to_when_the_next_callback_would_need_it(make_executor):
+    """So that this one need not set it, as long as it is not to end before."""
+    pool = pool_of(make_executor())
+    due, watch, now = pool.due, pool.parking.watch, monotonic_ns()
+    found = []
+    with pool.lock:
+        pool.running, pool.polling = True, 1
+        for latest in (11, 17, 60):  # of a timer that is due in 10 ms
+            timer = Appointment()
+            pool.agenda.set(timer, now + 10 * MS, now + latest * MS)
+            watch.arm(now + 2 * MS)
+            due.arm_idle(now)
+            found.append((watch.at - now) // MS)
+            pool.agenda.cancel(timer)
+        pool.running, pool.polling = False, 0
+    assert found == [30, 17, 30]
+
+
+def test_a_callback_is_not_looked_for_because_of_the_check_of_one_that_has_ended(make_executor):
+    pool = pool_of(make_executor(num_workers=2))
+    due, engine = pool.due, pool.engine
+    with pool.lock:
+        pool.running = True
+        now = pool.tick()
+        holder = new_entity(holds=True)
+        engine.ready(Work(holder, print), now)
+        work = engine.step(0, now).work
+        engine.ready(Work(new_entity(holds=True), print), now)
+        due.check.begin_if_wanted(now - pool.offset)
+        assert pool.agenda.latest < NEVER
+        now += 1_000 * MS
+        engine.finished(work, now, now, now, 0, 0)
+        assert engine.step(0, now).work
+        due.arm_late_look(now - pool.offset, 20 * MS)
+        assert pool.parking.watch.at == now - pool.offset + 20 * MS
+        pool.running = False
+
+
+@pytest.mark.parametrize('latest, is_done', [(0, True), (20 * MS, False)])
+def test_a_thread_does_itself_what_another_one_would_have_to_soon(
+        make_executor, latest, is_done):
+    """When its callback ends; the other one would be woken for it."""
+    pool = pool_of(make_executor())
+    me, entity, appointment = WorkerThread(pool, threading.current_thread()), new_entity(), None
+    entity.wall_ns = 0
+    with pool.lock:
+        pool.running = True
+        pool.engine.ready(Work(entity, print), pool.tick())
+        assert pool._choose(me, pool.now)
+        me.outcome, me.end = None, pool.now
+        now = pool.tick() - pool.offset
+        appointment = Appointment()
+        pool.agenda.set(appointment, now, now + latest)
+        pool._polled_at = pool.now + 1_000 * MS
+        pool._go_on(me, is_last=True)
+        pool.running = False
+        pool.agenda.cancel(appointment)
+        pool._n_parked += 1
+    assert appointment.is_done == is_done
 
 
 def test_what_nothing_waits_for_any_more_is_not_checked_and_not_kept():
