@@ -86,6 +86,13 @@ if TYPE_CHECKING:
 KEEP_STEPS = 100
 
 
+def _release_of(entity: Entity, due: int, now: int) -> int:
+    """Return the release of a job: neither to come, nor before its entity was managed."""
+    # CPython calls min() and max() slowly
+    release = due if due < now else now
+    return release if release > entity.since else entity.since
+
+
 class PublisherRecorder(Protocol):
     """
     Records publishers: see ``recorder.Recorder``.
@@ -235,7 +242,7 @@ class Engine:
         if entity.removed or self._finished:
             entity.leave([work])
             return
-        release = self._release_from(entity, due, now)
+        release = _release_of(entity, due, now)
         if work.was_reset and entity.waiting:
             self._drop_withdrawn(work, now)
         if entity.depth and len(entity.waiting) >= entity.depth:
@@ -254,13 +261,6 @@ class Engine:
         for x in list(newest.entity.waiting):
             if self._work[x].n_resets != newest.n_resets:
                 self._drop(newest.entity, x, 'withdrawn', now)
-
-    @staticmethod
-    def _release_from(entity: Entity, due: int, now: int) -> int:
-        """Return the release of a job: neither to come, nor before the entity was managed."""
-        # CPython calls min() and max() slowly
-        release = due if due < now else now
-        return release if release > entity.since else entity.since
 
     def _is_over(self, dag: int) -> bool:
         """
@@ -303,7 +303,7 @@ class Engine:
             entity.leave([work])
             return
         if entity.source >= 0:
-            self._start_job(work, self._release_from(entity, release, now), now)
+            self._start_job(work, _release_of(entity, release, now), now)
             if stamp >= 0 and self.other_processes is not None and work.origin is not None:
                 self.other_processes.note(stamp, work.origin)
             if 0 < entity.depth < len(entity.waiting):
