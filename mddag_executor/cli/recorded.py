@@ -155,30 +155,32 @@ def outcome_of(args: argparse.Namespace, source: Source) -> Replay | Reschedule:
         'policy': args.policy, 'workers': args.workers, 'preemptive': args.preemptive,
         'on_late': args.on_late, 'cpus': args.cpus}
     skip, name = args.begin or 0, source.name
-    settings = {**changes, 'skip': skip, 'name': name}
     if source.is_bag:
-        return _rescheduled_bag(args, source, settings)
+        return _rescheduled_bag(args, source, {**changes, 'skip': skip, 'name': name})
     options.reject_options(args, ('execution_times', 'seed'),
                    'a trace has its own execution times: leave the option out')
     from mddag_executor.simulate.policies import ALL_POLICIES
     from mddag_executor.sources.open import open_recording
     from mddag_executor.whatif.agreement import disagreement
-    from mddag_executor.whatif.reschedule import reschedule
-    processes = _processes(args)
+    from mddag_executor.whatif.reschedule import Changes, Observed
+    unchanged = Changes()
+    wanted = Changes(
+        overheads=args.overheads is None, dispatch_overhead=args.overheads or 0,
+        processes=_processes(args), **changes)
     with Progress('replaying') as line:
         recording = open_recording(source.path, source.task_set, name, line.events)
-        outcome = reschedule(
-            recording, overheads=args.overheads is None, dispatch_overhead=args.overheads or 0,
-            processes=processes, **settings)
-        is_changed = any(
-            each is not None for each in (args.overheads, processes, *changes.values()))
+        policy = recording.run.head.policy
+        if policy == args.policy:   # which may be one of the user's own
+            unchanged = Changes(policy=policy)
+        compares = wanted != unchanged and (
+            policy == args.policy or policy in ALL_POLICIES)
+        observed = Observed(recording, skip)
+        outcome = observed.reschedule(wanted, again=compares)
         text = None
-        recorded_policy = recording.run.head.policy
-        if not is_changed:
+        if compares:
+            text = disagreement(observed.reschedule(unchanged))
+        elif wanted == unchanged:
             text = disagreement(outcome)
-        elif recorded_policy == args.policy or recorded_policy in ALL_POLICIES:
-            same = args.policy if recorded_policy == args.policy else None
-            text = disagreement(reschedule(recording, policy=same, skip=skip))
     if text is not None:
         outcome.warnings.append(text)
     return outcome

@@ -109,6 +109,8 @@ execution held the interpreter, 0 if not; ``sent``: 1 if the message was publish
 """
 _ALWAYS = ('release', 'noticed', 'took', 'cpu', 'held')
 """The columns that are not all unknown if the recording has no executions."""
+_BUILT = 'took', 'cpu', 'held'
+"""The columns that become those of a load."""
 
 
 class LoadBuilder:
@@ -420,12 +422,19 @@ class LoadBuilder:
         return [[typical.get(vertex.callback.key, 0) for vertex in dag.vertices]
                 for dag in self._task_set.dags]
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state of a copy, which builds another load of the same recording."""
+        columns = {name: column.copy() if name in _BUILT else column
+                   for name, column in self._columns.items()}
+        return {**self.__dict__, '_columns': columns, '_skipped': set(self._skipped),
+                '_unheard': list(self._unheard)}
+
     def build(
         self, overheads: bool = True, process: Sequence[int] | None = None,
         workers: Sequence[int] | None = None,
     ) -> RecordedLoad:
         """
-        Return the load.
+        Return the load; it replaces the state of the builder, so copy a builder of several loads.
 
         :param process: by vertex the process to run it in, from 1; None: as recorded.
         :param workers: by such a process its number of workers; None: as recorded.

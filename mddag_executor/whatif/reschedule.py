@@ -10,8 +10,9 @@ transport.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TYPE_CHECKING
 
@@ -228,102 +229,166 @@ def reschedule(
     :raises mddag_executor.errors.MddagError: for an invalid policy, number of workers or CPUs, or
         overhead.
     """
-    if policy is not None:
-        preempts(policy, preemptive or False)
-    given_pools = (workers,) if isinstance(workers, int) else tuple((workers or {}).values())
-    check(Settings(
-        pools=given_pools or Settings.pools, cpus=cpus,
-        dispatch_overhead_ns=dispatch_overhead))
-    run = path if isinstance(path, Recording) else path() if callable(path) else open_recording(
-        path, task_set, name, progress)
-    if run.task_set is EMPTY_TASK_SET:
-        raise undeclared(run.name, run.run.imported)
-    head, given = run.run.head, policy
-    policy = _policy(head, run.name, policy)
-    if cpus is None:
-        cpus = head.cpus if head.cpus > 0 else None
-    if preemptive is None:
-        preemptive = head.preemptive and policy != ROS2
-    if on_late is None:     # any other number is damage
-        on_late = next((name for name, n in ON_LATE.items() if n == head.on_late), 'continue')
-    tables_of = partial(
-        Tables.build, default_deadline=head.default_deadline, on_late=on_late,
-        max_active_jobs=head.max_active_jobs if head.max_active_jobs > 0 else NEVER,
-        expire_after=EXPIRE_AFTER_NS)
-    tables = tables_of(run.task_set)
-    recorded = Replay(run, skip) if run.run.messages is None else None
-    with gc_paused():
-        builder = LoadBuilder(
-            run, tables, recorded_workers(run, run.run.placed), _processes(run, run.run.placed),
-            None if times is None else times(run))
-    give_back()
-    placed = _placed(run, builder) if processes is None else processes(
-        run.task_set, builder.times())
-    if len(placed) < 2:
-        placed = ()
-    if DEMOTE in tables.on_late:  # by measured times, as the executor does
-        tables = tables_of(with_execution_times(run.task_set, builder.times()))
-    tables = tables._replace(process=[*_processes(run, placed), 1])
-    pools = _pools(run, placed, workers)
-    notes = []
-    if given is None and len(placed) > 1 and policy == ROS2:
-        notes.append(
-            f'{run.name}: rescheduled with policy fifo, because {policy} (polling) is known of '
-            'one process only: choose another with --policy')
-        policy = 'fifo'
-    preempts(policy, preemptive, len(placed))
-    with gc_paused():
-        work = builder.build(overheads, tables.process, pools)
-    tables = with_groups(
-        tables, builder.callback_of, run.exclusive_groups(), declared_first=not run.run.same)
-    left_out = builder.left_out
-    del builder     # the load has copies of its data
-    if recorded is None:    # of a bag only the load is needed
-        run = replace(run, columns=Columns())
-    give_back()
-    warnings, judge_from = run.missing.lines(), run.run.begin + skip if skip else -NEVER
-    begin, judge_until = run.run.judged_releases or (-NEVER, NEVER)
-    if recorded is not None:
-        warnings, judge_from = recorded.warnings, recorded.judged.judge_from
-    warnings += notes
-    if work.silent and recorded is None:
-        raise ReplayError(
-            run.name, 'it has no execution times, and none is declared for '
-            f'{counted(len(work.silent), "callback")}: {listed(work.silent)}',
-            'give a GRAPH that declares it')
-    if work.elsewhere:
-        warnings.append(
-            f'{run.name}: {counted(len(work.elsewhere), "callback")} ran where nothing was '
-            f'recorded, so in what-ifs they take no time: {listed(work.elsewhere)}')
-    if work.silent:
-        warnings.append(
-            f'{run.name}: {counted(len(work.silent), "callback")} never ran in it, and no '
-            f'execution_time is declared, so what-ifs leave out: {listed(work.silent)}')
-    if left_out:
-        warnings.append(
-            f'{run.name}: {counted(left_out, "run")} of undeclared callbacks in processes of '
-            'declared ones take no time: declare them, as mddag graph from-trace does')
-    if cpus is not None and run.run.declared and work.executions and not len(work.load.computed):
-        warnings.append(
-            f'{run.name}: CPU times are not recorded in it, so with --cpus each '
-            'execution computes all the time')
-    waited = set(run.executions['vertex'][run.executions['piece'] > 0].tolist()) - {UNKNOWN}
-    if waited and not head.preemptive:
-        warnings.append(
-            f'{run.name}: the time in which coroutines waited is left out: '
-            + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
-    stepping = _stepping(run)
-    if stepping:
-        warnings.append(
-            f'{run.name}: the time in which programs did not spin is left out, as if they ran '
-            f'callbacks all the time: {listed(stepping)}')
-    settings = Settings(
-        policy, pools, run.end, preemptive, dispatch_overhead_ns=dispatch_overhead, cpus=cpus,
-        judge_from=max(begin, judge_from), judge_until=judge_until,
-        on_late=on_late)
-    with gc_paused():
-        return Reschedule(
-            run, work, tables, settings, warnings, skip, overheads, placed, recorded)
+    changes = Changes(
+        policy, workers, preemptive, on_late, overheads, dispatch_overhead, cpus, processes)
+    recording = path if isinstance(path, Recording) else path() if callable(path) else (
+        open_recording(path, task_set, name, progress))
+    observed = Observed(recording, skip, None if times is None else times(recording))
+    del recording   # of a bag only the load is needed
+    return observed.reschedule(changes)
+
+
+@dataclass(frozen=True)
+class Changes:
+    """
+    The parameters of a schedule, as those of ``reschedule``; None: as recorded.
+
+    :raises mddag_executor.errors.MddagError: for an invalid policy, number of workers or CPUs, or
+        overhead.
+    """
+
+    policy: str | None = None
+    workers: int | Mapping[str, int] | None = None
+    preemptive: bool | None = None
+    on_late: str | None = None
+    overheads: bool = True
+    dispatch_overhead: int = 0
+    cpus: int | None = None
+    processes: Callable[[TaskSet, list[list[int]]], Sequence[Process]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.policy is not None:
+            preempts(self.policy, self.preemptive or False)
+        pools = (self.workers,) if isinstance(self.workers, int) else tuple(
+            (self.workers or {}).values())
+        check(Settings(
+            pools=pools or Settings.pools, cpus=self.cpus,
+            dispatch_overhead_ns=self.dispatch_overhead))
+
+
+class Observed:
+    """
+    The load and the verdicts of a recording, of which schedules are made.
+
+    :param skip: warm-up time after the first release; jobs released in it are not judged, ns.
+    :param times: by DAG the execution times of its jobs and vertices, ns, for a recording without
+        executions.
+    """
+
+    def __init__(
+        self, recording: Recording, skip: int = 0, times: Sequence[Any] | None = None
+    ) -> None:
+        if recording.task_set is EMPTY_TASK_SET:
+            raise undeclared(recording.name, recording.run.imported)
+        self._run, self._skip = recording, skip
+        self._recorded = Replay(recording, skip) if recording.run.messages is None else None
+        placed = recording.run.placed
+        with gc_paused():
+            self._builder: LoadBuilder | None = LoadBuilder(
+                recording, Tables.build(recording.task_set), recorded_workers(recording, placed),
+                _processes(recording, placed), times)
+        give_back()
+
+    def reschedule(self, changes: Changes, *, again: bool = False) -> Reschedule:
+        """
+        Return a schedule of the recorded load.
+
+        :param again: whether another schedule will be made; otherwise the load is used up, which
+            takes less memory.
+        """
+        run, skip, recorded, builder = self._run, self._skip, self._recorded, self._builder
+        assert builder is not None, 'the load is used up'
+        self._builder = copy(builder) if again else None
+        head = run.run.head
+        policy = _policy(head, run.name, changes.policy)
+        cpus, preemptive, on_late = changes.cpus, changes.preemptive, changes.on_late
+        if cpus is None:
+            cpus = head.cpus if head.cpus > 0 else None
+        if preemptive is None:
+            preemptive = head.preemptive and policy != ROS2
+        if on_late is None:     # any other number is damage
+            on_late = next((name for name, n in ON_LATE.items() if n == head.on_late), 'continue')
+        tables_of = partial(
+            Tables.build, default_deadline=head.default_deadline, on_late=on_late,
+            max_active_jobs=head.max_active_jobs if head.max_active_jobs > 0 else NEVER,
+            expire_after=EXPIRE_AFTER_NS)
+        tables = tables_of(run.task_set)
+        placed = _placed(run, builder) if changes.processes is None else changes.processes(
+            run.task_set, builder.times())
+        if len(placed) < 2:
+            placed = ()
+        if DEMOTE in tables.on_late:  # by measured times, as the executor does
+            tables = tables_of(with_execution_times(run.task_set, builder.times()))
+        tables = tables._replace(process=[*_processes(run, placed), 1])
+        pools = _pools(run, placed, changes.workers)
+        notes = []
+        if changes.policy is None and len(placed) > 1 and policy == ROS2:
+            notes.append(
+                f'{run.name}: rescheduled with policy fifo, because {policy} (polling) is known '
+                'of one process only: choose another with --policy')
+            policy = 'fifo'
+        preempts(policy, preemptive, len(placed))
+        with gc_paused():
+            work = builder.build(changes.overheads, tables.process, pools)
+        tables = with_groups(
+            tables, builder.callback_of, run.exclusive_groups(), declared_first=not run.run.same)
+        left_out = builder.left_out
+        del builder     # the load has copies of its data
+        if recorded is None:    # of a bag only the load is needed
+            run = self._run = replace(run, columns=Columns())
+        give_back()
+        if work.silent and recorded is None:
+            raise ReplayError(
+                run.name, 'it has no execution times, and none is declared for '
+                f'{counted(len(work.silent), "callback")}: {listed(work.silent)}',
+                'give a GRAPH that declares it')
+        judge_from = run.run.begin + skip if skip else -NEVER
+        begin, judge_until = run.run.judged_releases or (-NEVER, NEVER)
+        warnings = run.missing.lines()
+        if recorded is not None:
+            warnings, judge_from = recorded.warnings, recorded.judged.judge_from
+        warnings = [*warnings, *notes, *self._doubts(work, left_out, cpus)]
+        settings = Settings(
+            policy, pools, run.end, preemptive, dispatch_overhead_ns=changes.dispatch_overhead,
+            cpus=cpus, judge_from=max(begin, judge_from), judge_until=judge_until,
+            on_late=on_late)
+        with gc_paused():
+            return Reschedule(
+                run, work, tables, settings, warnings, skip, changes.overheads, placed, recorded)
+
+    def _doubts(self, work: RecordedLoad, left_out: int, cpus: int | None) -> Iterator[str]:
+        """
+        Yield a warning for each part of the load that is not recorded.
+
+        :param left_out: number of runs of undeclared callbacks in other processes.
+        """
+        run = self._run
+        if work.elsewhere:
+            yield (
+                f'{run.name}: {counted(len(work.elsewhere), "callback")} ran where nothing was '
+                f'recorded, so in what-ifs they take no time: {listed(work.elsewhere)}')
+        if work.silent:
+            yield (
+                f'{run.name}: {counted(len(work.silent), "callback")} never ran in it, and no '
+                f'execution_time is declared, so what-ifs leave out: {listed(work.silent)}')
+        if left_out:
+            yield (
+                f'{run.name}: {counted(left_out, "run")} of undeclared callbacks in processes of '
+                'declared ones take no time: declare them, as mddag graph from-trace does')
+        if cpus is not None and run.run.declared and work.executions and not len(
+                work.load.computed):
+            yield (
+                f'{run.name}: CPU times are not recorded in it, so with --cpus each '
+                'execution computes all the time')
+        waited = set(run.executions['vertex'][run.executions['piece'] > 0].tolist()) - {UNKNOWN}
+        if waited and not run.run.head.preemptive:
+            yield (
+                f'{run.name}: the time in which coroutines waited is left out: '
+                + listed(sorted({run.task_set.vertices[v].callback.key for v in waited})))
+        if stepping := _stepping(run):
+            yield (
+                f'{run.name}: the time in which programs did not spin is left out, as if they '
+                f'ran callbacks all the time: {listed(stepping)}')
 
 
 def _stepping(run: Recording) -> list[str]:

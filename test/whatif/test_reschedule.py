@@ -12,9 +12,11 @@ from mddag_executor.recording.tables import EXECUTIONS
 from mddag_executor.simulate import PREEMPT, Settings, simulate, START
 from mddag_executor.simulate.deliveries import DELAY_NS
 from mddag_executor.simulate.workload import Workload
+from mddag_executor.sources.open import open_recording
 from mddag_executor.trace.schema import GOES_ON
 from mddag_executor.whatif import agreement
 from mddag_executor.whatif.agreement import disagreement
+from mddag_executor.whatif.reschedule import Changes, Observed
 from mddag_executor.whatif.run_writer import write_trace
 from msg_graph import loads, Process
 import pytest
@@ -621,6 +623,25 @@ nodes: [{node: /n, callbacks: [{name: t, timer: 100ms, deadline: 90ms}]}]
         done = call('replay', path, '--reschedule', *options)
         assert done.returncode == 0
         assert ('with the recorded pool' in done.stderr) == (points < 0)
+
+
+def test_several_schedules_of_one_recording_are_as_if_each_were_the_only_one(tmp_path):
+    """A single worker takes the CPU time of a callback, and two take its whole time."""
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+nodes: [{node: /n, callbacks: [{name: a, timer: 100ms, deadline: 6ms}]}]
+""", workers=2)
+    for job in range(60):
+        trace.release(0, job, job * 100)
+        trace.run(0, 0, job, job * 100, job * 100 + 8, computed=(4 * MS, True))
+    path = trace.end(6000)
+    observed = Observed(open_recording(path))
+    for changes, misses in (({'workers': 1}, False), ({}, True), ({'overheads': False}, True),
+                            ({'dispatch_overhead': 3 * MS, 'workers': 1}, True), ({}, True)):
+        outcome = observed.reschedule(Changes(**changes), again=True)
+        assert outcome.tally.missed == misses
+        assert outcome.result() == reschedule(path, **changes).result()
+    assert observed.reschedule(Changes()).result() == reschedule(path).result()
 
 
 def test_each_computed_process_has_a_pool_of_its_own(tmp_path):
