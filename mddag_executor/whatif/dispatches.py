@@ -28,7 +28,7 @@ import numpy as np
 
 def dispatch_times(
     worker: Ints, group: Ints, ready: Ints, start: Ints, end: Ints,
-    processes: Iterable[tuple[int, Ints]], holding: Mask,
+    processes: Iterable[tuple[int, Ints | slice]], holding: Mask,
 ) -> Ints:
     """
     Return the dispatch times of executions, ns.
@@ -43,14 +43,17 @@ def dispatch_times(
     free = np.maximum(ready, _end_before(group, end))
     could = np.maximum(free, _end_before(worker, end))
     for n_workers, mine in processes:
-        waiting = mine[free[mine] < could[mine]]
-        n_free, n_ended = (np.searchsorted(np.sort(times[mine]), free[waiting], 'right')
-                           for times in (free, end))
-        at_once = waiting[n_free - n_ended <= n_workers]
-        could[at_once] = free[at_once]
-        mine = mine[holding[mine]]
-        place = as_of(end[mine], start[mine])
-        could[mine] = np.maximum(could[mine], np.where(place >= 0, end[mine][place], 0))
+        free_at, could_at, begin, until, holds = (
+            column[mine] for column in (free, could, start, end, holding))
+        waiting = np.flatnonzero(free_at < could_at)
+        at = free_at[waiting]
+        n_free = np.searchsorted(np.sort(free_at, kind='stable'), at, 'right')  # almost sorted
+        at_once = waiting[n_free - np.searchsorted(until, at, 'right') <= n_workers]
+        could_at[at_once] = free_at[at_once]
+        until = until[holds]
+        place = as_of(until, begin[holds])
+        could_at[holds] = np.maximum(could_at[holds], np.where(place >= 0, until[place], 0))
+        could[mine] = could_at
     late: Ints = np.maximum(0, start - could)
     return late
 

@@ -109,6 +109,9 @@ execution held the interpreter, 0 if not; ``sent``: 1 if the message was publish
 """
 _ALWAYS = ('release', 'noticed', 'took', 'cpu', 'held')
 """The columns that are not all unknown if the recording has no executions."""
+_PIECES = ['vertex', 'piece', 'ready', 'start', 'end', 'worker', 'holds_gil', 'cpu', 'completes',
+           'inherited']
+"""The columns of executions that dispatch times need."""
 _BUILT = 'took', 'cpu', 'held'
 """The columns that become those of a load."""
 
@@ -176,6 +179,8 @@ class LoadBuilder:
             0, dtype=np.int64)
         # places of optional messages that were published, and that no callback ran for
         self._unheard: list[Ints] = []
+        #: The median of the dispatch times of the declared executions; None: there are none.
+        self._usual_dispatch: int | None = None
         #: Callbacks that ran where nothing was recorded.
         self._elsewhere = dict[str, None]()
         #: By place of an execution that did not complete: how long it has run, ns.
@@ -188,12 +193,15 @@ class LoadBuilder:
         places = recording.job_places
         #: By execution the row of its job.
         self._row = np.where(places >= 0, places - jobs.first[table['dag']], _UNKNOWN)
+        # by execution the place of its vertex in its job, _UNKNOWN if it has no job
+        self._place = np.where((self._row >= 0) & (table['vertex'] >= 0), self._places(
+            _VERTEX, self._row, table['vertex']), _UNKNOWN)
         self._note_pieces()
         self._note_completions()
         self._note_incomplete()
         self._note_elsewhere()
         self._note_publications()
-        del self._row, self._executions
+        del self._row, self._place, self._executions
 
     def _of(self, dag: int, *names: str) -> list[Any]:
         """Return the columns of a DAG as views; those of vertices and edges have a row a job."""
@@ -232,37 +240,44 @@ class LoadBuilder:
             other = (table['vertex'][rows] < 0) & (process > 0)
             self.left_out = int((other & (process < len(self._recording.run.placed))).sum())
             rows = rows[~other]
-        vertex, piece, ready, start, end, worker, holds, cpu, completes = (
-            table[name][rows] for name in (
-                'vertex', 'piece', 'ready', 'start', 'end', 'worker', 'holds_gil', 'cpu',
-                'completes'))
-        row, first = self._row[rows], piece == 0
-        process = np.array(self._process, dtype=np.int16)[vertex]
-        members = [(number, np.flatnonzero(process == number))
-                   for number in sorted(set(self._process))]
+        row, place = self._row, self._place
+        if len(rows) < len(table) or (rows[1:] < rows[:-1]).any():
+            table, row, place = table[_PIECES][rows], row[rows], place[rows]
+        vertex, ready, start, end, cpu = table.columns('vertex', 'ready', 'start', 'end', 'cpu')
+        first = table['piece'] == 0
+        members: list[tuple[int, Ints | slice]] = [(self._process[0], slice(None))]
+        if len(set(self._process)) > 1:
+            process = np.array(self._process, dtype=np.int16)[vertex]
+            members = [(number, np.flatnonzero(process == number))
+                       for number in sorted(set(self._process))]
         for number, mine in members:
             self._find_turns(number, start[mine], end[mine])
-        ready[~first] = start[~first]
+        ready = np.where(first, ready, start)
         others = np.flatnonzero(vertex < 0)
         # ready, duration, index of the dispatch time or -1, inherited deadline or 0: undeclared
         # callbacks, and legs that completed nothing
         self._others = [np.column_stack((
-            ready[others], (end - start)[others], others, table['inherited'][rows[others]]))]
+            ready[others], (end - start)[others], others, table['inherited'][others]))]
         source = np.flatnonzero((row >= 0) & np.isin(vertex, self._tables.source[:-1]))
         turn = self._columns['turn'][self._places(_JOB, row[source], vertex[source])]
         known = first[source] & (turn >= 0)
         ready[source[known]] = turn[known]
         self._dispatch_ns = dispatch_times(
-            worker, self._groups(rows, vertex), ready, start, end,
+            table['worker'], self._groups(rows, vertex), ready, start, end,
             [(self._workers[number - 1], mine) for number, mine in members],
-            holds & (cpu >= 0) & (completes == recorded_tables.VERTEX))
+            table['holds_gil'] & (cpu >= 0) & (table['completes'] == recorded_tables.VERTEX))
         ran_as = np.full(self._tables.n_vertices + 1, _UNKNOWN)
         ran_as[vertex[::-1]] = rows[::-1]     # the first one is written last
         callback = self._recording.executions['callback']
         self.callback_of = {
             v: int(callback[at]) for v, at in enumerate(ran_as[:-1].tolist()) if at >= 0}
-        mine = np.flatnonzero(first & (row >= 0) & (vertex >= 0))
-        self._columns['dispatch'][self._places(_VERTEX, row[mine], vertex[mine])] = mine
+        begun = np.flatnonzero(first & (place >= 0))
+        number = self._columns['dispatch']
+        number[place[begun]] = begun
+        known = number[number >= 0]
+        if len(known):
+            self._usual_dispatch = quantile(
+                memoryview(np.sort(self._dispatch_ns[known])), 0.5)
 
     def _find_turns(self, process: int, start: Ints, end: Ints) -> None:
         """
@@ -272,7 +287,7 @@ class LoadBuilder:
 
         :param start: of the executions of a process; ``end``: likewise, ascending.
         """
-        start = np.append(np.sort(start), NEVER)
+        start = np.append(np.sort(start, kind='stable'), NEVER)     # almost sorted
         for dag, source in enumerate(self._tables.source[:-1]):
             if not self._timer[dag] or self._process[source] != process or not len(end):
                 continue
@@ -302,8 +317,8 @@ class LoadBuilder:
         """Note the execution times of executions that completed a vertex."""
         table, columns = self._executions, self._columns
         rows = np.flatnonzero(
-            (table['completes'] != recorded_tables.NOTHING) & (table['vertex'] >= 0)
-            & (self._row >= 0) & (table['start'] >= 0))
+            (table['completes'] != recorded_tables.NOTHING) & (self._place >= 0)
+            & (table['start'] >= 0))
         rows = rows[sort_by(table['order'][rows])]
         row, vertex, ready, leg, completes = self._row[rows], *(
             table[name][rows] for name in ('vertex', 'ready', 'leg', 'completes'))
@@ -321,7 +336,8 @@ class LoadBuilder:
         self._others.append(np.column_stack((
             ready[~ended], table['busy'][rows[~ended]], np.full(int((~ended).sum()), _UNKNOWN),
             np.zeros(int((~ended).sum()), dtype=np.int64))))
-        place, done = self._places(_VERTEX, row[ended], vertex[ended]), rows[ended]
+        done = rows[ended]
+        place = self._place[done]
         for name, column in (('took', 'busy'), ('cpu', 'cpu'), ('held', 'holds_gil'),
                              ('start', 'began'), ('end', 'end')):
             columns[name][place] = table[column][done]
@@ -334,9 +350,9 @@ class LoadBuilder:
 
     def _note_incomplete(self) -> None:
         """Note how long executions ran that did not complete: open ones until the end at least."""
-        table, row = self._executions, self._row
-        rows = np.flatnonzero((table['vertex'] >= 0) & (row >= 0) & (table['start'] >= 0))
-        place = self._places(_VERTEX, row[rows], table['vertex'][rows])
+        table = self._executions
+        rows = np.flatnonzero((self._place >= 0) & (table['start'] >= 0))
+        place = self._place[rows]
         missing = self._columns['took'][place] < 0
         rows, place = rows[missing], place[missing]
         start, end = table['start'][rows], table['end'][rows]
@@ -608,12 +624,8 @@ class LoadBuilder:
 
     def _dispatches(self) -> tuple[Any, int | None, Any]:
         """Return dispatch times by number (the last: the median), the median, and by execution."""
-        number = self._columns.pop('dispatch')
-        known = number[number >= 0]
-        usual = quantile(
-            memoryview(np.sort(self._dispatch_ns[known])), 0.5) if len(known) else None
-        every = np.append(self._dispatch_ns, usual or 0)     # number -1
-        return every, usual, every[number]
+        every = np.append(self._dispatch_ns, self._usual_dispatch or 0)     # number -1
+        return every, self._usual_dispatch, every[self._columns.pop('dispatch')]
 
     def _subtract_others(self, alone: Mask) -> None:
         """

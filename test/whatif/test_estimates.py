@@ -24,9 +24,12 @@ def late(n_workers, *executions, holding=()):
     worker, group, ready, start, end = (
         np.array([-1 if each is None else each for each in column], dtype=np.int64)
         for column in zip(*executions))
-    return dispatch_times(
-        worker, group, ready, start, end, [(n_workers, np.arange(len(worker)))],
-        np.isin(np.arange(len(worker)), holding)).tolist()
+    order = np.argsort(end, kind='stable')
+    found = np.empty(len(worker), dtype=np.int64)
+    found[order] = dispatch_times(
+        *(column[order] for column in (worker, group, ready, start, end)),
+        [(n_workers, np.arange(len(worker)))], np.isin(order, holding))
+    return found.tolist()
 
 
 COMPUTE = [
