@@ -134,7 +134,8 @@ def test_a_callback_that_does_not_end_is_named(
             # on a busy machine another callback may run for long as well
             return (level, where in message, message.count('has run for')) == (1, True, 1)
         assert wait_for(is_reported)
-        session.hurry()
+        if how != 'future':     # a coroutine does not keep the run from its end
+            session.hurry()
     assert session.clean == (how == 'future')
     statistics = executor.statistics()
     lines = [line for line in live_lines({**statistics, 'measured': None})
