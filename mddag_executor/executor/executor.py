@@ -528,9 +528,9 @@ class MultiDeadlineExecutor(BareExecutor):
 
     def _end_spin(self) -> None:
         """Let another thread spin, or end the executor if ``shutdown`` could not."""
-        self._ending.close()
         self._engine.spin_gaps.begin(EXECUTOR, self._trace_clock.now())
         self._spinning.release()
+        self._close_unless_spinning()   # another thread may have ended the run meanwhile
         if self._must_shut_down:
             self.shutdown()
 
@@ -838,7 +838,7 @@ class MultiDeadlineExecutor(BareExecutor):
         return finished and reported and in_time
 
     def _close_unless_spinning(self) -> None:
-        """Close the descriptors, once the run has ended; a spin does that at its end."""
+        """Close the descriptors, once the run has ended; a spin does that after its end."""
         if self._spinning.acquire(blocking=False):
             self._ending.close()
             self._spinning.release()
