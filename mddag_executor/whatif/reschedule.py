@@ -392,14 +392,18 @@ class Observed:
 
 
 def _stepping(run: Recording) -> list[str]:
-    """Return the declared callbacks that waited until something spun, for 1 % of the time."""
+    """
+    Return the declared callbacks that waited until something spun, for 1 % of the time.
+
+    Those that still waited at the end of the run do not count: the load lacks them anyway.
+    """
     found: set[str] = set()
     table, gaps = run.executions, run.spin_gaps
     least = (run.end - (run.start or run.end)) / 100
     for program, mine, _, _ in run.closed_times():
         of = gaps[gaps['program'] == program]
         rows = np.flatnonzero(
-            mine & (table['vertex'] >= 0) & (table['piece'] == 0) & (table['start'] >= 0))
+            mine & (table['vertex'] >= 0) & (table['piece'] == 0) & (table['worker'] >= 0))
         waited = Spans(*crowded(of['start'], of['end'], 1)).within(
             table['ready'][rows], table['start'][rows])
         if waited.sum() > least:

@@ -386,7 +386,7 @@ class Full(Node):
     def __init__(self):
         super().__init__('full')
         self.create_timer(0.001, lambda: None)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, resource.RLIM_INFINITY))
 """
 
 
