@@ -416,4 +416,7 @@ def _observed(task_set: TaskSet, results: Results) -> Observed:
         topics_received=received, publishes={**publishes},
         nodes={c.node for c in task_set.callbacks if str(task_set.process_of(c.node)) in parts},
         undeclared=[Entity(*each) for part in parts.values() for each in part['undeclared']],
+        # of the process that should have it: no other one lacks it
+        gone={key: lacks for name, part in parts.items() for key, lacks in part['gone'].items()
+              if str(task_set.process_of(key.rpartition(':')[0])) == name},
         outside=[tuple(each) for part in parts.values() for each in part['outside']])

@@ -228,6 +228,15 @@ def test_a_second_interrupt_abandons_what_hangs_in_any_process(world):
     assert result['never_ran'] == [] and 'never ran' not in out
 
 
+def test_what_a_program_destroyed_is_reported_of_each_process(world, mddag):
+    (world / 'two.yaml').write_text(TWO_PROCESSES)
+    run = mddag('run', 'two.yaml', '--node', 'quits:a', '--node', 'quits:b',
+                '--duration', '2500ms', '--json', 'result.json')
+    result = json.loads(Path('result.json').read_text())
+    assert [each['callback'] for each in result['drift'] if 'was destroyed' in each['text']] == [
+        '/a:t', '/b:t'], run.stderr
+
+
 def test_a_killed_process_is_named_and_the_others_go_on_if_asked(world):
     with running('graph.yaml', *NODES, '--on-exit', 'continue', '--trace', 'out.mcap') as run:
         wait_for_run(run, (world / 'enough').exists)
