@@ -761,9 +761,8 @@ class MultiDeadlineExecutor(BareExecutor):
         :raises Exception: the exception of a callback.
         """
         import asyncio  # rclpy does without it
-        if not self._spinning.acquire(blocking=False):
-            raise RuntimeError('Executor is already spinning')
         loop = asyncio.get_running_loop()
+        self._begin_spin()
         try:
             with self._pool.in_spin_once(), self._signals.watch():
                 while not self.is_ending() and not self._was_ended():

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 
-from mddag_executor import MultiDeadlineExecutor, replay
+from mddag_executor import MultiDeadlineExecutor, open_recording, replay
 from mddag_executor.analysis.drift import drift_of
 from mddag_executor.executor import current_job
 from mddag_executor.executor.asyncio_loop import Turnstile
@@ -549,6 +549,31 @@ def test_spin_async_ends_as_spin_does(make_executor, ros_context):
             await asyncio.wait_for(spinning, 10)
 
     asyncio.run(main())
+
+
+def test_spin_async_is_no_time_without_a_spin(make_executor, make_node, tmp_path):
+    path, node, ran = tmp_path / 'run.mcap', make_node(), []
+    node.create_timer(0.005, lambda: ran.append(1))
+    executor = make_executor(nodes=[node], trace=path)
+    assert wait_for(lambda: executor.spin_once(0.1) or ran)
+
+    async def main():
+        spinning = asyncio.ensure_future(executor.spin_async())
+        while len(ran) < 5:
+            await asyncio.sleep(0.001)
+        spinning.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await spinning
+
+    asyncio.run(asyncio.wait_for(main(), patience(15)))
+    time.sleep(0.002)
+    executor.shutdown()
+    recording = open_recording(path)
+    gaps = recording.spin_gaps[recording.spin_gaps['program'] == -1]
+    starts = recording.executions['start']
+    assert len(gaps) and len(starts) >= 5
+    assert not [(gap, start) for gap in gaps for start in starts
+                if gap['start'] < start < gap['end']]
 
 
 def test_a_callback_of_asyncio_that_does_not_end_is_abandoned(
