@@ -41,6 +41,7 @@ class SpinGaps:
             self._record('spin_gap', now, get_native_id(), program, since, now)
 
     def finish(self, now: int) -> None:
-        """Record the gaps that last until the end of the run."""
+        """Record the gaps that last until the end of the run, and nothing after that."""
         for program in list(self._since):
             self.end(program, now)
+        self._record = None

@@ -103,6 +103,19 @@ def test_the_times_between_spins_are_recorded(
     assert (gaps['start'][1:] >= gaps['end'][:-1]).all()
 
 
+def test_a_program_that_spins_after_the_end_of_the_run_loses_no_event(make_executor, tmp_path):
+    """The trace is complete then, so nothing is lost that it could have."""
+    executor = make_executor(trace=tmp_path / 'run.mcap')
+    group = executor.new_outer_group(True)
+    group.open(1)
+    executor.spin_once(0)
+    executor.shutdown()
+    group.open(0)
+    time.sleep(0.01)
+    group.open(1)
+    assert executor.statistics()['trace']['lost'] == 0
+
+
 def test_what_waits_moves_with_its_node(make_executor, make_node):
     """As if it had come to the group that its node belongs to now."""
     node, got = make_node(), []
