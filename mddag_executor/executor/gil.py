@@ -14,10 +14,11 @@ starts a callback that holds the GIL only if no callback as urgent holds it (rul
     over four fifths of wall, the callback holds the GIL.  If own is less than half of the time in
     which no other thread computed, the callback waits for something else and does not hold the
     GIL, unless it was preempted on its CPU and may have waited for that.  Anything between is
-    inconclusive.  Until the habit is known, and after an inconclusive execution, the kernel is
-    asked how long the thread of a long callback has waited for a CPU.  This time does not count
-    as a part of wall, and preemptions do not matter then.  (A callback that sleeps for a second
-    is always preempted on a busy machine: without that time, nothing would ever follow.)
+    inconclusive.  Until the habit is known, after an inconclusive execution, and during a trial
+    (2.), the kernel is asked how long the thread of a long callback has waited for a CPU.  This
+    time does not count as a part of wall, and preemptions do not matter then.  (A callback that
+    sleeps for a second is always preempted on a busy machine: without that time, nothing would
+    ever follow.)
     Each execution is measured until the habit is known.  After that one in ``SELDOM`` short
     executions is, one in ``LATELY`` of a callback that waits for long, and each one of a callback
     that computes for long or has just behaved differently.
@@ -133,7 +134,8 @@ class GilHabit:
     @property
     def is_doubtful(self) -> bool:
         """Return whether its next execution should be measured exactly (25 us)."""
-        return not self.is_declared and (not self.is_known or self.unclear > 0) and (
+        return not self.is_declared and (
+            not self.is_known or self.unclear > 0 or self._is_trial) and (
             not self._runs or max(self.mean_ns, self._least) > SHORT_CALLBACK_NS)
 
     def learn(self, wall: int, own: int, others: int, starved: bool = False) -> None:

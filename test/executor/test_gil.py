@@ -107,6 +107,22 @@ def test_what_is_learnt_of_callbacks(make_executor, make_node):
     assert sleeping is None or sleeping < 0.5
 
 
+def test_a_trial_of_a_callback_is_measured_exactly():
+    """Else it is inconclusive on a busy machine, as those before it were that led to it."""
+    habit = GilHabit()
+    for _ in range(10):
+        habit.took(1 * MS, 20 * MS)
+        habit.learn(20 * MS, 1 * MS, 0)
+    assert habit.is_known and not habit.computes and not habit.is_doubtful
+    while not habit.holds:  # until there is a trial
+        habit.took(9 * MS, 20 * MS)
+        habit.learn(20 * MS, 9 * MS, 4 * MS)
+        assert habit.is_doubtful
+    habit.took(1 * MS, 20 * MS)
+    habit.learn(20 * MS, 1 * MS, 0)
+    assert not (habit.holds or habit.is_doubtful)
+
+
 # --- what arrives next to a callback that computes for long --------------------------------------
 
 COMPUTING = declare(*(
