@@ -131,7 +131,7 @@ class Upkeep:
     def _run_left(self, entity: Kind) -> None:
         """Make those executions ready that another executor has left."""
         left = transfer_of(entity.rclpy_object).left
-        while left:
+        for _ in range(len(left)):  # an engine that has finished leaves them again
             before = left.popleft()
             work = Work(entity, before.function, before.args, before.then)
             self._pool.report(partial(self._arrived, work))

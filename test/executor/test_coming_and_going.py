@@ -10,12 +10,13 @@ import os
 import random
 import threading
 import time
+from types import SimpleNamespace
 import weakref
 
 from mddag_executor.core.state import State
 from mddag_executor.executor import publishing, waitables
 from mddag_executor.executor.registry import OTHERS
-from mddag_executor.executor.transfers import Transfer
+from mddag_executor.executor.transfers import Transfer, transfer_of
 from msg_graph import loads
 import pytest
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
@@ -435,6 +436,18 @@ def test_what_waits_moves_with_its_node(make_executor, make_node, shuts_down):
             assert wait_for(moving.has_all)
             assert wait_for(lambda: is_idle(after))
     assert moving.has_all() and [each for each in moving.heard if each >= 0] == [0, 1, 2]
+
+
+def test_an_executor_that_has_ended_leaves_what_another_one_has_left(make_executor, make_node):
+    node = make_node()
+    subscription = node.create_subscription(Header, '/a', print, 10)
+    executor = make_executor(nodes=[node])
+    executor.spin_once(0)
+    executor.abandon_callbacks()    # its run has ended, and it still has its nodes
+    transfer_of(subscription).leave([
+        SimpleNamespace(function=print, args=(number,), then=None) for number in range(3)])
+    assert executor.unmatched() == []   # brings its entities up to date
+    assert [each.args for each in transfer_of(subscription).left] == [(0,), (1,), (2,)]
 
 
 @pytest.mark.parametrize('then', ['moves', 'comes_back', 'shuts_down'])
