@@ -57,8 +57,9 @@ class Bindings:
             c.key for c in self.declared if c.kind == 'timer' and c.sporadic}
         #: The keys of the declared callbacks that have had an entity.
         self._found: set[str] = set()
-        #: By declared callback and topic: when its only entity disappeared, engine's time.
-        self._gone: dict[tuple[str, str], int] = {}
+        #: By declared callback, by topic: when its only entity disappeared, engine's time.
+        self._gone: dict[str, Mapping[str, int]] = {}
+        engine.verdicts.gone = self._gone.keys()
         # of the warning: when the executor began to judge (monotonic s), and whether it is over
         self._begin: float | None = None
         self._has_checked = task_set is None
@@ -82,8 +83,10 @@ class Bindings:
         engine = self._engine
         assert self._task_set is not None
         self._found.add(callback.key)
-        self._gone.pop((callback.key, entity.topic), None)
-        engine.verdicts.gone = {*self.gone()}
+        lacks = self._gone.pop(callback.key, {})
+        if lacks.keys() - {entity.topic}:   # a sync lacks another one
+            self._gone[callback.key] = {
+                topic: at for topic, at in lacks.items() if topic != entity.topic}
         entity.declare(callback)
         link(entity, self._task_set, engine.tables)
         entity.awaiting = engine.answers.awaiting.get(callback.key)
@@ -97,13 +100,12 @@ class Bindings:
         """Free the declared callback of an entity that has disappeared."""
         if self._binder is not None and entity.callback is not None:
             self._binder.release(entity.callback, entity.topic or None)
-            self._gone[entity.callback.key, entity.topic] = now
-            self._engine.verdicts.gone = {*self.gone()}
+            key = entity.callback.key
+            self._gone[key] = {**self._gone.get(key, {}), entity.topic: now}
 
     def gone(self) -> dict[str, int]:
-        """Return by declared callback when an entity disappeared that it still lacks."""
-        return {key: at for (key, _), at in sorted(
-            self._gone.copy().items(), key=lambda item: item[1], reverse=True)}
+        """Return by declared callback when the first entity disappeared that it still lacks."""
+        return {key: min(lacks.values()) for key, lacks in self._gone.copy().items()}
 
     def note_received(self, entity: Entity) -> None:
         """Note of which topic the callback of an entity has got messages."""

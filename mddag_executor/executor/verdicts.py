@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 import threading
 from typing import Any, Protocol
@@ -81,8 +81,9 @@ class Verdicts:
         #: How many misses were reported, each of them once.
         self.missed = 0
         self._last_missed = -1, -1
-        #: The declared callbacks that lack a timer, a subscription or a service that they had.
-        self.gone: set[str] = set()
+        #: The declared callbacks that lack a timer, a subscription or a service that they had
+        #: (``bindings.Bindings`` keeps them).
+        self.gone: Collection[str] = ()
         self.record = record
         self._dags = task_set.dags if task_set is not None else ()
         self._tables = tables
