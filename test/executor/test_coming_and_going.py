@@ -450,6 +450,35 @@ def test_an_executor_that_has_ended_leaves_what_another_one_has_left(make_execut
     assert [each.args for each in transfer_of(subscription).left] == [(0,), (1,), (2,)]
 
 
+def test_a_sync_lacks_what_it_had_until_it_has_all_again(make_executor, make_node):
+    node = make_node()
+    executor = make_executor(loads(graph(node="""
+        name: a, timer: 1s, publishes: [/a, /b]
+        name: sync, sync: [/a, /b], deadline: 1s""")), nodes=[node])
+    bindings, verdicts = registry_of(executor).bindings, engine_of(executor).verdicts
+
+    def make(topic):
+        return node.create_subscription(Header, topic, print, 10)
+
+    subscriptions = [make('/a'), make('/b')]
+    executor.spin_once(0)
+    assert not verdicts.gone and not bindings.gone()
+    for subscription in subscriptions:
+        node.destroy_subscription(subscription)
+        executor.spin_once(0)
+        if subscription is subscriptions[0]:
+            first = bindings.gone()
+            assert [*first] == [*verdicts.gone] == ['/node:sync']
+    assert bindings.gone() == first     # since it has lacked any
+    make('/a')
+    executor.spin_once(0)
+    assert '/node:sync' in verdicts.gone and bindings.gone().keys() == first.keys()
+    assert bindings.gone() != first
+    make('/b')
+    executor.spin_once(0)
+    assert not verdicts.gone and not bindings.gone()
+
+
 @pytest.mark.parametrize('then', ['moves', 'comes_back', 'shuts_down'])
 def test_what_a_spin_once_has_not_run_moves_with_its_node(make_executor, make_node, then):
     moving = Moving(make_node)
