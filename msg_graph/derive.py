@@ -122,7 +122,7 @@ def loads(
 @contextmanager
 def gc_paused() -> Iterator[None]:
     """
-    Switch the cyclic garbage collector off.
+    Switch the cyclic garbage collector of the whole process off, for all of its threads.
 
     Reading a declaration or a recording makes hundreds of thousands of objects and no garbage;
     the collector would take up to a quarter of the time.

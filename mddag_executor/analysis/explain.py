@@ -13,6 +13,7 @@ last event before it.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from functools import cached_property
 from typing import Any, TYPE_CHECKING
 
@@ -193,17 +194,15 @@ class Explanation:
 
     def _busy_programs(self) -> tuple[dict[int, Spans], dict[int, Spans]]:
         """Return ``programs`` and ``gaps`` of ``Pool``."""
-        found: dict[int, list[tuple[Ints, Ints]]] = {}
-        gaps: dict[int, Spans] = {}
-        for program, mine, starts, ends in self._recording.closed_times():
-            vertices = distinct(self._recording.executions['vertex'][mine])
+        programs, gaps = (defaultdict[int, list[tuple[Ints, Ints]]](list) for _ in range(2))
+        for closed in self._recording.closed_times():
+            vertices = distinct(self._recording.executions['vertex'][closed.executions])
             for vertex in vertices[vertices >= 0].tolist():
-                found.setdefault(vertex, []).append((starts, ends))
-                if program == -1:
-                    gaps[vertex] = Spans(*crowded(starts, ends, 1))
-        programs = {vertex: map(np.concatenate, zip(*times)) for vertex, times in found.items()}
-        return {vertex: Spans(*crowded(starts, ends, 1))
-                for vertex, (starts, ends) in programs.items()}, gaps
+                # it may have run in several processes
+                programs[vertex].append(closed.times)
+                gaps[vertex].append(closed.halts)
+        return ({vertex: _any_of(times) for vertex, times in programs.items()},
+                {vertex: _any_of(times) for vertex, times in gaps.items()})
 
     def _busy(self, rows: Ints, place: int, hangs: Mask) -> Busy:
         """Return when executions occupied all workers, and when they may have held the GIL."""
@@ -662,3 +661,8 @@ def medians(numbers: Any, times: Ints, count: int) -> Ints:
     middle = (2 * below >= below[:, -1:]).argmax(axis=1)
     found = np.exp2(np.minimum((middle + 0.5) / _STEPS, 62))    # 64 bits
     return np.where(below[:, -1] > 0, found, 0).astype(np.int64)
+
+
+def _any_of(times: list[tuple[Ints, Ints]]) -> Spans:
+    starts, ends = map(np.concatenate, zip(*times))
+    return Spans(*crowded(starts, ends, 1))

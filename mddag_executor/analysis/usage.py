@@ -109,9 +109,9 @@ def program_waits(recording: Recording, in_group: Ints) -> Ints:
     if not closed:
         return np.broadcast_to(np.int64(0), len(table))     # which takes no memory
     waited = np.zeros(len(table), dtype=np.int64)
-    for _, of_program, starts, ends in closed:
-        rows = np.flatnonzero(of_program & (table['piece'] == 0) & (table['start'] >= 0))
-        occupied = Spans(*crowded(starts, ends, 1)).within(
+    for each in closed:
+        rows = np.flatnonzero(each.executions & (table['piece'] == 0) & (table['start'] >= 0))
+        occupied = Spans(*crowded(*each.times, 1)).within(
             table['ready'][rows], table['start'][rows])
         waited[rows] = np.maximum(0, occupied - in_group[rows])
     later, first = later_pieces(table)

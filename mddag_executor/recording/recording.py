@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 from mddag_executor.core import NEVER
 from mddag_executor.recording import cut, frames
@@ -22,6 +22,27 @@ from mddag_executor.recording.run import Run
 from mddag_executor.recording.tables import Columns, UNKNOWN, WITHDRAWN
 from msg_graph import TaskSet
 import numpy as np
+
+
+class Closed(NamedTuple):
+    """
+    When executions of one program in one process could not start: starts and ends.
+
+    :ivar executions: of the program, or of the process and no program of one callback at a time.
+    :ivar runs: of its executions that kept others waiting (``Recording.runs_of_programs``).
+    :ivar gaps: between its spins; ``halts``: between those of the executor of the process.
+    """
+
+    executions: Mask
+    runs: tuple[Ints, Ints]
+    gaps: tuple[Ints, Ints]
+    halts: tuple[Ints, Ints]
+
+    @property
+    def times(self) -> tuple[Ints, Ints]:
+        """Return all of them; they may overlap."""
+        starts, ends = map(np.concatenate, zip(self.runs, self.gaps, self.halts))
+        return starts, ends
 
 
 @dataclass(frozen=True, repr=False)
@@ -205,25 +226,21 @@ class Recording:
             found[number] = mine[np.r_[mine['start'][1:] >= mine['end'][:-1], True]]
         return found
 
-    def closed_times(self) -> Iterator[tuple[int, Mask, Ints, Ints]]:
-        """
-        Yield programs, their executions, and starts and ends of what kept these waiting.
-
-        That is: executions of a program that runs one callback at a time, and the gaps between its
-        spins; and the gaps between the spins of the executor of a process (program -1).
-        """
-        runs, gaps, program = self.runs_of_programs(), self.spin_gaps, (
-            self.programs_of_executions)
-        numbers = {*runs, *distinct(gaps['program']).tolist()} - {-1}
-        for number in sorted(numbers):
-            mine = gaps[gaps['program'] == number]
-            ran = runs.get(number, self.executions[:0])
-            yield number, program == number, *(
-                np.r_[ran[name], mine[name]] for name in ('start', 'end'))
-        gaps = gaps[gaps['program'] == -1]
-        for process in distinct(gaps['process']).tolist():
-            mine = gaps[gaps['process'] == process]
-            yield -1, self.executions['process'] == process, mine['start'], mine['end']
+    def closed_times(self) -> Iterator[Closed]:
+        """Yield by program and process when executions could not start; each is in at most one."""
+        gaps, of = self.spin_gaps, self.programs_of_executions
+        if not self.names.programs and not len(gaps):
+            return
+        runs, process = self.runs_of_programs(), self.executions['process']
+        for place in distinct(process).tolist():
+            of_place = process == place
+            halts = gaps[(gaps['program'] == -1) & (gaps['process'] == place)]
+            for number in distinct(of[of_place]).tolist():
+                ran = runs.get(number, self.executions[:0])
+                between = gaps[(gaps['program'] == number) & (number >= 0)]
+                if len(ran) or len(between) or len(halts):
+                    yield Closed(of_place & (of == number), *(
+                        (each['start'], each['end']) for each in (ran, between, halts)))
 
     def exclusive_groups(self) -> dict[int, int]:
         """

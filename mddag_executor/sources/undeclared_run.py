@@ -356,14 +356,17 @@ class UndeclaredRun(ImportedRun):
 
     def _spin_gaps(self) -> Table:
         gaps = []
-        for event in self._events.others:
-            if event[0].name != _SPIN_GAP or not all(isinstance(each, int) for each in event[4:]):
+        for layout, time, pid, _, *values in self._events.others:
+            if layout.name != _SPIN_GAP:
                 continue
-            _, time, pid, _, program, start, end = event    # its time may have been moved
+            fields = dict(zip(layout.fields, values))
+            program, begin, end = (fields.get(each) for each in ('program', 'begin', 'end'))
+            if not (isinstance(program, int) and isinstance(begin, int) and isinstance(end, int)):
+                continue
             number = program if program == -1 else self.who.program(pid, program)
-            if program == -1 or number >= 0:
+            if program == -1 or number >= 0:    # the time may have been moved
                 gaps.append((
-                    self._process.get(pid, UNKNOWN), number, time - (end - start), time))
+                    self._process.get(pid, UNKNOWN), number, time - (end - begin), time))
         process, program, start, end = zip(*gaps) if gaps else ((),) * 4
         return rows(SPIN_GAPS, len(gaps), process=process, program=program, start=start, end=end)
 

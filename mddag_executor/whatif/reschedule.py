@@ -395,17 +395,18 @@ def _stepping(run: Recording) -> list[str]:
     """
     Return the declared callbacks that waited until something spun, for 1 % of the time.
 
-    Those that still waited at the end of the run do not count: the load lacks them anyway.
+    Those that still waited at the end of the run do not count: the load lacks them anyway.  Nor
+    does the time in which their program ran others, which the schedule has too.
     """
     found: set[str] = set()
-    table, gaps = run.executions, run.spin_gaps
+    table = run.executions
     least = (run.end - (run.start or run.end)) / 100
-    for program, mine, _, _ in run.closed_times():
-        of = gaps[gaps['program'] == program]
-        rows = np.flatnonzero(
-            mine & (table['vertex'] >= 0) & (table['piece'] == 0) & (table['worker'] >= 0))
-        waited = Spans(*crowded(of['start'], of['end'], 1)).within(
-            table['ready'][rows], table['start'][rows])
+    for closed in run.closed_times():
+        rows = np.flatnonzero(closed.executions & (table['vertex'] >= 0) & (
+            table['piece'] == 0) & (table['worker'] >= 0))
+        every, behind_others = (Spans(*crowded(*times, 1)).within(
+            table['ready'][rows], table['start'][rows]) for times in (closed.times, closed.runs))
+        waited = every - behind_others
         if waited.sum() > least:
             found.update(run.task_set.vertices[vertex].callback.key
                          for vertex in distinct(table['vertex'][rows[waited > 0]]).tolist())

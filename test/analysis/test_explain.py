@@ -116,6 +116,8 @@ def test_the_right_cause_is_told(cause, tmp_path):
         trace.group('mutually_exclusive', 1001, 1100)       # of /victim:use and /heavy:first
     if plan.pop('in_program', False):
         trace.program(3, 1001, 1100)
+        # the executor no longer spins at the end, when nothing waits
+        trace.add('spin_gap', 50 * JOBS, -1, ns(50 * JOBS - 1), ns(50 * JOBS))
     for job in range(JOBS):
         if special == 'sync':
             record_sync(trace, job, **plan if job % 5 == 4 else {})
@@ -143,6 +145,23 @@ def test_the_right_cause_is_told(cause, tmp_path):
                   if part['cause'] == cause for each in part['behind'] if each['ns'] > 5 * MS}
         assert behind == {'/heavy:first', '/heavy:second'}.difference(
             () if cause == 'waited' else ['/heavy:second'])
+
+
+def test_a_callback_waits_for_its_program_and_then_for_the_executor(tmp_path):
+    """Another one of the program ran until 11 ms, and nothing spun from 8 to 20 ms."""
+    trace = Written(tmp_path / 'run.mcap', VICTIM, 6)
+    trace.program(3, 1001, 1100)
+    for job in range(JOBS):
+        at = 50 * job
+        record(trace, job, wait=19, others=0)
+        trace.release(1, job, at)
+        trace.run(1, 0, job, at + 1, at + 11, worker=1)
+        trace.add('spin_gap', at + 20, -1, ns(at + 8), ns(at + 20))
+    outcome = replay(trace.end(50 * JOBS))
+    usage = outcome.usage.callbacks()['/victim:use']
+    assert (usage['waiting_ns'], usage['waiting_program_ns']) == (19 * MS * JOBS, 19 * MS * JOBS)
+    times = {part['cause']: part['ns'] for part in outcome.explanation.worst()['parts']}
+    assert times['program'] == 19 * MS
 
 
 @pytest.mark.parametrize('lets_others_run', [False, True])

@@ -87,6 +87,35 @@ def test_a_callback_waits_for_what_runs_in_its_own_process(where, cause, tmp_pat
         cause: 3}
 
 
+@pytest.mark.parametrize('whose', ['up', 'down'])
+def test_a_callback_waits_until_something_spins_in_its_own_process(tmp_path, whose):
+    """It waited from 3 to 6 ms, and both processes began to spin later than they started."""
+    traces = {name: Trace(tmp_path, name, vertex) for vertex, name in enumerate(('up', 'down'))}
+    for job in range(3):
+        at = (1 + job) * 20 * MS
+        traces['up'].runs(at, at + MS)
+        traces['down'].runs(at, at + 6 * MS, ready=at + 3 * MS)
+        traces[whose].add('spin_gap', at + 6 * MS, -1, BASE + at + 3 * MS, BASE + at + 6 * MS)
+    for trace in traces.values():
+        trace.add('spin_gap', 5 * MS, -1, BASE, BASE + 5 * MS)
+    outcome = reschedule([trace.end(100 * MS) for trace in traces.values()])
+    assert ['did not spin' in each for each in outcome.warnings] == [True] * (whose == 'down')
+
+
+def test_what_a_restarted_process_waited_for_before_counts(tmp_path):
+    """Its timer was noticed 10 ms late in both runs of it, as nothing spun."""
+    first = Trace(tmp_path, 'up', 0)
+    again = Trace(tmp_path, 'up.2', 0, begin=60 * MS, judges_from=60 * MS)
+    down = Trace(tmp_path, 'down', 1)
+    for at, trace in ((20 * MS, first), (80 * MS, again)):
+        trace.add('spin_gap', at + 10 * MS, -1, BASE + at, BASE + at + 10 * MS)
+        trace.runs(at, at + 10 * MS)
+        down.runs(at, at + 12 * MS)
+    found = replay([first.end(50 * MS), again.end(120 * MS), down.end(120 * MS)])
+    assert {name: n for name, n in found.explanation.summary()['causes'].items() if n} == {
+        'program': 2}
+
+
 @pytest.mark.parametrize('apart', [20_000, 0])
 def test_the_messages_of_a_burst_keep_their_jobs(tmp_path, apart):
     up, down = Trace(tmp_path, 'up', 0), Trace(tmp_path, 'down', 1)

@@ -263,6 +263,27 @@ nodes:
         'callbacks all the time: /n:b'] * is_long
 
 
+@pytest.mark.parametrize(('pause', 'is_long'), [(0, False), (10, True)])
+def test_a_program_that_spins_once_for_each_callback_only_pauses_between_them(
+        tmp_path, pause, is_long):
+    """Its gaps begin when a callback starts; b waits for a, which is the same in a what-if."""
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: a, timer: 50ms, dag: a, deadline: 40ms}]}
+  - {node: /m, callbacks: [{name: b, timer: 50ms, dag: b, deadline: 40ms}]}
+""", 2)
+    trace.program(3, 1000, 1100)
+    for job in range(10):
+        at, then = 50 * job, 50 * job + 20 + pause
+        for dag, start in enumerate((at, then)):
+            trace.release(dag, job, at)
+            trace.run(dag, 0, job, start, start + 20, ready=at)
+        trace.add('spin_gap', then, 3, ns(at), ns(then))
+    found = [each for each in reschedule(trace.end(500)).warnings if 'did not spin' in each]
+    assert [each.endswith(': /m:b') for each in found] == [True] * is_long
+
+
 def test_the_messages_of_a_simulated_sync_took_no_time(tmp_path, call):
     """It ran once, when the later message was there: that of its first leg."""
     graph, path = tmp_path / 'g.yaml', tmp_path / 'a.mcap'
