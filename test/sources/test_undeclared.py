@@ -9,10 +9,10 @@ from pathlib import Path
 
 from hypothesis import given
 from hypothesis import strategies as st
-from mddag_executor import replay
+from mddag_executor import open_recording, replay
 from mddag_executor.sources import stamps_without_numbers
 from mddag_executor.sources.stamps import find_stamps, Sent
-from mddag_executor.trace import EVENTS, TraceFile, TraceReader
+from mddag_executor.trace import EVENTS, EventType, TraceFile, TraceReader
 from msg_graph import loads
 import numpy as np
 import pytest
@@ -480,3 +480,20 @@ def test_numbers_decide_between_publications_at_the_same_time():
         found, unknown = find_stamps(sent, stamps[taken], numbers[taken])
         expected = [0 if row in doubtful else stamps[row] for row in range(6)]
         assert found.tolist() == expected and unknown == stamps[doubtful].tolist()
+
+
+def test_a_gap_between_spins_may_have_more_fields(tmp_path):
+    """As a later version may write them, in another order."""
+    trace = Written(tmp_path / 'run.mcap', '', 2)
+    kind = trace.file.define(EventType('mddag', 'spin_gap', (
+        ('reason', 'int64'), ('end', 'int64'), ('begin', 'int64'), ('program', 'int64'))))
+    trace.add('rcl_node_init', 0, 1, 1, 'n', '/')
+    trace.add('rcl_timer_init', 0, 20, 100 * MS)
+    trace.add('rclcpp_timer_callback_added', 0, 20, GRAB)
+    trace.add('rclcpp_timer_link_node', 0, 20, 1)
+    trace.add('dispatch', 10, GRAB, -1, -1, -1, 0, ns(10), 0)
+    trace.add('callback_start', 10, GRAB, False)
+    trace.add('callback_end', 11, GRAB)
+    trace.add(kind, 40, 7, ns(40), ns(20), -1)
+    gap, = open_recording(trace.end(50)).spin_gaps.records().tolist()
+    assert gap[1:] == (-1, ns(20), ns(40))
