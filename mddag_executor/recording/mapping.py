@@ -206,12 +206,21 @@ def matches(names: Names, declared: TaskSet) -> dict[int, Target]:
             binders.append(Binder(declared))
         binder = binders[times[node]]
         times[node] += 1
+        goes: list[tuple[int, Target]] = []
         for each in callbacks:
+            # as in the executor, a new one may be the next of a callback that lost its entity
+            for time, target in goes:
+                if time <= each.made:
+                    binder.release(target.callback, target.topic or None)
+            goes = [(time, target) for time, target in goes if time > each.made]
             bound = binder.bind(each.entity, function_of(each.symbol)) if (
                 each.entity and each.number) else None
             if bound is not None:
                 leg = bound.topics.index(each.start) if each.start in bound.topics else 0
-                found[each.number] = Target(bound, leg, each.start if bound.topics else '')
+                target = Target(bound, leg, each.start if bound.topics else '')
+                found[each.number] = target
+                if each.gone is not None:
+                    goes.append((each.gone, target))
     return found
 
 

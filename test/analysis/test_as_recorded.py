@@ -5,6 +5,7 @@
 import re
 
 from mddag_executor import replay, ReplayError, reschedule
+from mddag_executor.analysis.drift import drift_of
 from mddag_executor.recording.head import Head
 from mddag_executor.recording.tables import ALL_LEGS, VERTEX
 from mddag_executor.report.replays import times_tables
@@ -396,3 +397,28 @@ def test_jobs_that_version_2_aborted_are_counted_and_rescheduled_as_demoted(
         assert result['on_late'] == 'demote'
     else:
         assert reschedule(path).task_set.dags[0].on_late == 'demote'
+
+
+@pytest.mark.parametrize('is_made_again', [False, True])
+def test_a_timer_that_was_made_again_and_did_not_fire_is_not_destroyed(tmp_path, is_made_again):
+    trace = Written(tmp_path / 'run.mcap', """\
+mddag: 1
+nodes:
+  - {node: /n, callbacks: [{name: a, timer: 100ms, deadline: 50ms}]}
+""")
+
+    def make(at, address):
+        trace.add('rcl_timer_init', at, address, 100 * MS)
+        trace.add('rclcpp_timer_callback_added', at, address, address)
+        trace.add('rclcpp_timer_link_node', at, address, 1)
+
+    trace.add('rcl_node_init', 0, 1, 1, 'n', '/')
+    make(0, 1000)
+    for job in range(10):
+        trace.release(0, job, job * 100)
+        trace.run(0, 0, job, job * 100, job * 100 + 1)
+    trace.add('gone', 950, 1000)
+    if is_made_again:
+        make(960, 2000)
+    found = [each.text for each in drift_of(open_recording(trace.end(4000)))]
+    assert any('destroyed' in each for each in found) is not is_made_again, found
