@@ -497,3 +497,21 @@ def test_a_gap_between_spins_may_have_more_fields(tmp_path):
     trace.add(kind, 40, 7, ns(40), ns(20), -1)
     gap, = open_recording(trace.end(50)).spin_gaps.records().tolist()
     assert gap[1:] == (-1, ns(20), ns(40))
+
+
+def test_a_timer_that_was_destroyed_and_made_again_is_the_same_callback(tmp_path):
+    trace = Written(tmp_path / 'run.mcap', '', 2)
+    trace.add('rcl_node_init', 0, 1, 1, 'n', '/')
+    for timer, first in ((20, 0), (30, 500)):
+        trace.add('rcl_timer_init', first, timer, 100 * MS)
+        trace.add('rclcpp_timer_callback_added', first, timer, timer + 1)
+        trace.add('rclcpp_timer_link_node', first, timer, 1)
+        for at in range(first + 100, first + 401, 100):
+            trace.add('dispatch', at, timer + 1, -1, -1, -1, 0, ns(at), 0, ns(at))
+            trace.add('callback_start', at, timer + 1, False)
+            trace.add('callback_end', at + 1, timer + 1)
+        trace.add('gone', first + 450, timer + 1)
+    graph = loads('mddag: 1\nnodes: [{node: /n, callbacks: ['
+                  '{name: a, timer: 100ms, deadline: 9ms}]}]')
+    result = replay(trace.end(1000), graph).result()
+    assert result['callbacks']['/n:a']['executions'] == 8
