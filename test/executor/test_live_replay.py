@@ -355,7 +355,7 @@ def test_what_waits_at_the_end_was_not_lost(make_executor, make_node, tmp_path):
     assert causes['group'] > 1 and sum(causes.values()) > 10
     # the others are those of a busy machine
     assert {cause for cause, n in causes.items() if n} <= {
-        'group', 'released late', 'machine', 'interpreter'}
+        'group', 'released late', 'machine', 'interpreter', 'waited'}
     assert [each.kind for each in outcome.drift()] == []
 
 
