@@ -57,7 +57,7 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
     waits = (end < 0) & (start >= recording.end)
     late = (end >= since) | (end < 0)
     numbers, callback_of = recording.callbacks()
-    keys = keys_of(recording)
+    keys.update(_ran_as(recording))
     counts, late_counts, late_got = (dict(zip(numbers.tolist(), np.bincount(
         callback_of[which], minlength=len(numbers)).tolist()))
         for which in (every & ~waits, every & ~waits & late, every & late))
@@ -118,14 +118,17 @@ def drift_of(recording: Recording, skip: int = 0) -> list[Drift]:
 
 def keys_of(recording: Recording) -> dict[int, str]:
     """Return by callback the declared one: that of the vertex that it ran as, or that fits."""
-    keys = declared_keys(recording.names, recording.run.recorded_set)
+    return {**declared_keys(recording.names, recording.run.recorded_set), **_ran_as(recording)}
+
+
+def _ran_as(recording: Recording) -> dict[int, str]:
+    """Return by callback the declared one of the vertex that it ran as."""
     table, vertices = recording.executions, recording.task_set.vertices
     ran_as = recording.vertices_of_callbacks((table['vertex'] >= 0) & (table['start'] >= 0))
-    keys.update(
-        (callback, vertices[vertex].callback.key)
+    return {
+        callback: vertices[vertex].callback.key
         for callback, vertex in zip(recording.callbacks()[0].tolist(), ran_as.tolist())
-        if vertex >= 0)
-    return keys
+        if vertex >= 0}
 
 
 def gone_at(names: Names, keys: Mapping[int, str]) -> dict[str, int]:
